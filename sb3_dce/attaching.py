@@ -1,0 +1,199 @@
+"""How an offline agent comes by its data: by id, file or object, read lazily, kept out of everything that is saved."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_dce import hyperparams
+from sb3_dce.buffers import OfflineReplayBuffer
+from sb3_dce.data import Transitions, find_file, load_transitions
+from sb3_dce.data.catalog import DatasetSpec, resolve
+from sb3_dce.envs import SpacesEnv, dataset_spaces, make_env_if_possible
+from sb3_dce.errors import ConfigError, DatasetSemanticsError, DatasetWarning
+from sb3_dce.networks import StandardizedExtractor
+
+DatasetLike = str | os.PathLike[str] | Transitions
+SelfAttaching = TypeVar("SelfAttaching", bound="AttachingMixin")
+
+
+class AttachingMixin(OffPolicyAlgorithm):
+    """What :class:`~sb3_dce.base.OfflineAlgorithm` adds about datasets."""
+
+    algo_name: ClassVar[str]
+    dataset: str | None
+    d4rl_compat: bool
+    normalize_obs: bool
+    reward_normalization: str | None
+    reward_scale: float
+    reward_shift: float
+    # Filled at attach, saved with the model: what diagnostics and reward scaling need to know of the data.
+    dataset_statistics: dict[str, Any] | None
+    _transitions: Transitions | None
+
+    @classmethod
+    def load_dataset(
+        cls: type[SelfAttaching],
+        name: DatasetLike,
+        env: GymEnv | str | None = None,
+        policy: str | type[BasePolicy] | None = None,
+        **overrides: Any,
+    ) -> SelfAttaching:
+        """
+        A ready agent for a dataset: its file is found, its row of the zoo's hyperparameter file applied.
+
+        ``OfflineDCE.load_dataset("walker2d-medium").learn(1e6)`` is the shortest way to a trained agent.
+
+        :param name: catalogue id, embedded id, path of an HDF5 file, or ``Transitions``
+        :param env: environment for evaluation; ``None`` makes the dataset's own if its simulator is installed
+        :param policy: policy name or class; ``None`` takes that of the row
+        :param overrides: constructor arguments that replace those of the row
+        :return: model; the data themselves are read at the first ``learn()``
+        :raises DatasetNotFoundError: if there is no file for the name
+        :raises ConfigError: for an unknown hyperparameter
+        """
+        spec = None if isinstance(name, Transitions) else find_file(name)[1]
+        rows = hyperparams.read_rows(cls.algo_name)
+        row = rows["default"] if spec is None else hyperparams.load_row(cls.algo_name, spec.id)
+        arguments = {**hyperparams.split_row(row).kwargs, **overrides}
+        hyperparams.check_keys(cls, overrides, where=f"{cls.__name__}.load_dataset")
+        hyperparams.check_keys(cls, arguments, where=f"zoo_hyperparams/{cls.algo_name}.yml")
+        arguments["dataset"] = name
+        arguments["policy"] = policy or arguments.get("policy", "MlpPolicy")
+        if env is None and spec is not None:
+            env = make_env_if_possible(spec.id)
+        return cls(env=env, **arguments)
+
+    def set_dataset(self, dataset: DatasetLike) -> None:
+        """
+        Train on other data from the next ``learn()`` on.
+
+        :param dataset: catalogue id, path of an HDF5 file, or ``Transitions``
+        """
+        self._remember_dataset(dataset)
+        assert isinstance(self.replay_buffer, OfflineReplayBuffer)
+        self.replay_buffer.reset()
+
+    def _remember_dataset(self, dataset: DatasetLike | None) -> DatasetSpec | None:
+        """Keep the id or path (saved), and the data themselves if they were given as an object (never saved)."""
+        self._transitions, self.dataset = None, None
+        if dataset is None:
+            return None
+        if isinstance(dataset, Transitions):
+            self._transitions = dataset
+            self.dataset = None if dataset.info.path is None else str(Path(dataset.info.path).resolve())
+            return None
+        if is_path(dataset):
+            path, spec = find_file(dataset)
+            self.dataset = str(path.resolve())  # a relative path would be lost after a change of folder
+            return spec
+        spec = resolve(os.fspath(dataset))
+        self.dataset = spec.id
+        return spec
+
+    def _spaces_env(self, spec: DatasetSpec | None) -> gym.Env:
+        """Environment without a simulator, from the catalogue or from the data."""
+        if spec is not None:
+            return SpacesEnv(*dataset_spaces(spec))
+        if self.dataset is None and self._transitions is None:
+            name = type(self).__name__
+            raise ConfigError(
+                "neither an environment nor a dataset is given",
+                key="env",
+                hint=f"Pass env='HalfCheetah-v4', or dataset=<id or file>; {name}.load_dataset(<id>) does both.",
+            )
+        transitions = self._load_transitions()
+        return SpacesEnv(
+            spaces.Box(-np.inf, np.inf, transitions.obs_shape, np.float64),
+            spaces.Box(-1.0, 1.0, (transitions.act_dim,), np.float32),
+        )
+
+    def _load_transitions(self) -> Transitions:
+        if self._transitions is None:
+            if self.dataset is None:
+                raise ConfigError(
+                    "there is nothing to learn from: the model has no dataset",
+                    key="dataset",
+                    hint="Pass dataset=<id or file> to the constructor, or call model.set_dataset(<id or file>).",
+                )
+            options: dict[str, Any] = {}
+            if hasattr(self, "action_space"):  # not yet while the spaces themselves are read from the data
+                options = {"action_low": self.action_space.low.reshape(-1), "action_high": self.action_space.high.reshape(-1)}
+            self._transitions = load_transitions(self.dataset, d4rl_compat=self.d4rl_compat, **options)
+        return self._transitions
+
+    def attach_dataset(self) -> None:
+        """
+        Read the dataset into the replay buffer, if that has not been done.
+
+        :raises ConfigError: if the model has no dataset
+        :raises DatasetError: if the data cannot be read or do not fit the model
+        """
+        assert isinstance(self.replay_buffer, OfflineReplayBuffer)
+        if self.replay_buffer.size() > 0:
+            return
+        transitions = self._load_transitions()
+        self.replay_buffer.attach(transitions)
+        info, returns = transitions.info, transitions.info.episode_returns
+        self.dataset_statistics = {
+            "rows": info.rows,
+            "reward_mean": float(info.reward_mean),
+            "reward_abs_max": float(max(abs(info.reward_min), abs(info.reward_max))),
+            "return_range": float(returns.max() - returns.min()) if len(returns) else 0.0,
+            "n_terminals": int(info.n_terminals),
+        }
+        reward_mean = self._reward_factor() * info.reward_mean + self.reward_shift
+        for text in self.check_dataset_fits(reward_mean, info.n_terminals):
+            warnings.warn(text, DatasetWarning)
+        if self.normalize_obs:
+            self._standardize(transitions)
+        self._transitions = None  # the buffer holds the rows now
+
+    def check_dataset_fits(self, reward_mean: float, n_terminals: int) -> list[str]:
+        """
+        :param reward_mean: mean reward per row as the agent sees it
+        :param n_terminals: true terminals in the data
+        :return: texts of warnings
+        """
+        return []
+
+    def _reward_factor(self) -> float:
+        """Factor on the rewards of the data."""
+        if self.reward_normalization is None:
+            return self.reward_scale
+        span = 0.0 if self.dataset_statistics is None else self.dataset_statistics["return_range"]
+        if span <= 0.0:
+            raise DatasetSemanticsError(
+                "return range is 0: reward_normalization='iql' divides by the largest minus the smallest episode return",
+                key="reward_normalization",
+                hint="Use reward_normalization=None, or data with at least two whole episodes of different return.",
+            )
+        return self.reward_scale * 1000.0 / span
+
+    def _standardize(self, transitions: Transitions) -> None:
+        # Each network has its own extractor, and the moving averages cover parameters only: all get the statistics.
+        observations = transitions.observations
+        mean = th.as_tensor(observations.mean(axis=0, dtype=np.float64).reshape(-1))
+        std = th.as_tensor(observations.std(axis=0, dtype=np.float64).reshape(-1))
+        for module in self.policy.modules():
+            if isinstance(module, StandardizedExtractor):
+                module.set_statistics(mean, std)
+
+
+def is_path(name: str | os.PathLike[str]) -> bool:
+    """
+    :param name: id of the catalogue or path
+    :return: whether it is meant as a path
+    """
+    text = os.fspath(name)
+    return not isinstance(name, str) or os.sep in text or text.endswith((".hdf5", ".h5")) or Path(text).is_file()

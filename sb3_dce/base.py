@@ -1,0 +1,443 @@
+"""
+The base class of all offline agents: a Stable-Baselines3 algorithm that learns from a dataset and steps no environment.
+
+One timestep of ``learn()`` is one gradient step and one call of ``callback.on_step()``, so that every frequency of every
+callback keeps its meaning and an evaluation at step N sees exactly N updates.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+import warnings
+from typing import Any, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+
+from sb3_dce.attaching import AttachingMixin, DatasetLike
+from sb3_dce.buffers import OfflineReplayBuffer
+from sb3_dce.checks import callback_frequencies, check_choice, check_number
+from sb3_dce.envs import SpacesEnv
+from sb3_dce.errors import ConfigError, SB3DCEWarning
+from sb3_dce.execution import EXECUTIONS, Engine, Update, choose_execution, refuse_divergence
+from sb3_dce.networks import StandardizedExtractor
+from sb3_dce.noise import NoiseSpec
+from sb3_dce.saving import SavingMixin
+from sb3_dce.state import Storage, TrainState
+
+SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
+
+# Metrics are read back at least this often (updates), so that a divergence is noticed even without logging.
+GUARD_INTERVAL = 1000
+
+
+class OfflineAlgorithm(AttachingMixin, SavingMixin):
+    """
+    Base of the offline agents. A subclass states its update and its networks; everything else is here, once.
+
+    :param policy: ``"MlpPolicy"`` or a policy class
+    :param env: environment for evaluation, an id, or ``None``: then a dataset gives the spaces. It is never stepped for
+        training
+    :param dataset: catalogue id ("walker2d-medium"), path of an HDF5 file in D4RL layout, or a ``Transitions`` object.
+        Read at the first ``learn()``; only its id or path is saved with the model
+    :param learning_rate: Adam's learning rate for all networks, or a schedule of the remaining progress
+    :param batch_size: rows per gradient step, drawn uniformly with replacement
+    :param tau: Polyak coefficient of the targets (the paper's upsilon)
+    :param gamma: discount factor in [0, 1]
+    :param gradient_steps: gradient steps per call of ``train()``; the callbacks' frequencies must be multiples of it
+    :param d4rl_compat: use exactly the rows of D4RL's ``qlearning_dataset``
+    :param normalize_obs: standardise observations with the dataset's mean and deviation, kept in the saved networks
+    :param reward_normalization: ``"iql"`` multiplies rewards by 1000 / (largest - smallest episode return)
+    :param reward_scale: factor on every reward
+    :param reward_shift: added to every reward after scaling, reward units
+    :param execution: ``"eager"``, ``"compile"``, or ``"auto"``: compile when more than 10,000 updates are planned and a
+        C++ compiler is there
+    :param stats_window_size: kept for Stable-Baselines3's logger
+    :param tensorboard_log: folder of TensorBoard logs
+    :param policy_kwargs: arguments of the policy, such as ``net_arch`` or ``n_critics``
+    :param verbose: 0 quiet, 1 information, 2 debugging
+    :param seed: fixes networks, batches and noise
+    :param device: ``"auto"``, ``"cpu"``, ``"cuda"``
+    :param needs_env: refuse a missing environment without a dataset (False while a saved model is loaded)
+    :raises ConfigError: for a wrong parameter or combination
+    """
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str | None,
+        dataset: DatasetLike | None,
+        learning_rate: float | Schedule,
+        *,
+        batch_size: int,
+        tau: float,
+        gamma: float,
+        gradient_steps: int,
+        d4rl_compat: bool,
+        normalize_obs: bool,
+        reward_normalization: str | None,
+        reward_scale: float,
+        reward_shift: float,
+        execution: str,
+        stats_window_size: int,
+        tensorboard_log: str | None,
+        policy_kwargs: dict[str, Any] | None,
+        verbose: int,
+        seed: int | None,
+        device: th.device | str,
+        needs_env: bool,
+    ) -> None:
+        self.d4rl_compat = d4rl_compat
+        spec = self._remember_dataset(dataset)
+        if env is None and needs_env:
+            env = self._spaces_env(spec)
+        super().__init__(
+            policy,
+            env,  # type: ignore[arg-type]
+            learning_rate,
+            learning_starts=0,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            train_freq=(1, "step"),
+            gradient_steps=gradient_steps,
+            replay_buffer_class=OfflineReplayBuffer,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            seed=seed,
+            sde_support=False,
+            supported_action_spaces=(spaces.Box,),
+        )
+        self.normalize_obs = normalize_obs
+        self.reward_normalization = reward_normalization
+        self.reward_scale = reward_scale
+        self.reward_shift = reward_shift
+        self.execution = execution
+        self.dataset_statistics = None
+        self._engine: Engine | None = None
+        self._generator: th.Generator | None = None
+        self._coef: dict[str, th.Tensor] = {}
+        self._warned_large_q = False
+
+    # -- to be stated by a subclass --------------------------------------------------------------------------------
+
+    def make_storages(self) -> dict[str, Storage]:
+        """
+        :return: storage of each network by name
+        """
+        raise NotImplementedError
+
+    def make_update(self, storages: dict[str, Storage]) -> Update:
+        """
+        :param storages: as returned by :meth:`make_storages`
+        :return: pure update ``(state, batch, noise, coef, **variant) -> (new state, metrics)``
+        """
+        raise NotImplementedError
+
+    def noise_specs(self, batch_size: int) -> dict[str, NoiseSpec]:
+        """
+        :param batch_size: rows per gradient step
+        :return: random numbers one update needs
+        """
+        raise NotImplementedError
+
+    def _create_aliases(self) -> None:
+        raise NotImplementedError
+
+    def update_variant(self, n_updates: int) -> dict[str, Any]:
+        """
+        :param n_updates: completed updates
+        :return: choices of the next update that are fixed when it is traced
+        """
+        return {}
+
+    def coefficients(self, n_updates: int) -> dict[str, float]:
+        """
+        :param n_updates: completed updates
+        :return: numbers of the next update that may change while training
+        """
+        return {
+            "learning_rate": self.lr_schedule(self._current_progress_remaining),
+            "tau": self.tau,
+            "gamma": self.gamma,
+            "reward_scale": self._reward_factor(),
+            "reward_shift": self.reward_shift,
+        }
+
+    def policy_settings(self) -> dict[str, Any]:
+        """
+        :return: arguments of the policy that follow from the agent's own parameters
+        """
+        return {"features_extractor_class": StandardizedExtractor} if self.normalize_obs else {}
+
+    def derived_metrics(self, means: dict[str, float]) -> dict[str, float]:
+        """
+        :param means: metrics of the last interval
+        :return: further ones computed from them
+        """
+        return {}
+
+    def check_parameters(self) -> None:
+        """
+        :raises ConfigError: if a parameter is out of its range
+        """
+        check_number("batch_size", self.batch_size, 1, integer=True)
+        check_number("gradient_steps", self.gradient_steps, 1, integer=True)
+        check_number("tau", self.tau, 0, 1, hint="The paper's Polyak coefficient is 0.005; its tau is called expectile.")
+        check_number("gamma", self.gamma, 0, 1)
+        check_number("reward_scale", self.reward_scale, 0, open_low=True)
+        check_choice("execution", self.execution, EXECUTIONS)
+        check_choice("reward_normalization", self.reward_normalization, (None, "iql"))
+        if not callable(self.learning_rate):
+            check_number("learning_rate", self.learning_rate, 0, hint="The paper uses 3e-4.")
+
+    # -- construction ----------------------------------------------------------------------------------------------
+
+    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
+        if policy_name not in self.policy_aliases:
+            raise ConfigError(
+                f"policy {policy_name!r} is not offered: allowed are {sorted(self.policy_aliases)}",
+                key="policy",
+                hint="Offline data of this package are vectors: use 'MlpPolicy', or pass a policy class.",
+            )
+        return self.policy_aliases[policy_name]
+
+    def _setup_model(self) -> None:
+        self.check_parameters()
+        given = self.policy_kwargs
+        self.policy_kwargs = {**self.policy_settings(), **given}
+        try:
+            super()._setup_model()
+        finally:
+            # The user's own arguments are what is saved and compared at load time.
+            self.policy_kwargs = given
+        self._create_aliases()
+        self.setup_extras()
+        self._engine = None
+        self._coef = {}
+
+    def setup_extras(self) -> None:
+        """Create what the networks do not hold: the random generator; subclasses add their temperature."""
+        if not hasattr(self, "rng_state"):
+            self._seed_generator(self.seed)
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        super().set_random_seed(seed)
+        self._seed_generator(seed)
+
+    def _seed_generator(self, seed: int | None) -> None:
+        """All randomness of training comes from this one generator; its state is saved, so a loaded model goes on."""
+        generator = th.Generator(device=self.device)
+        generator.manual_seed(int.from_bytes(os.urandom(4), "little") if seed is None else seed)
+        self._generator = None
+        self.rng_state = generator.get_state()
+
+    def _training_generator(self) -> th.Generator:
+        if self._generator is None:
+            self._generator = th.Generator(device=self.device)
+            try:
+                self._generator.set_state(self.rng_state)
+            except RuntimeError:  # saved on another kind of device
+                self._generator.manual_seed(0 if self.seed is None else self.seed)
+        return self._generator
+
+    # -- training --------------------------------------------------------------------------------------------------
+
+    def train(self, gradient_steps: int, batch_size: int = 256) -> None:
+        """
+        Run gradient steps on batches of the dataset. Nothing is read back from the device.
+
+        :param gradient_steps: number of steps
+        :param batch_size: rows per step
+        """
+        self.attach_dataset()
+        buffer = self.replay_buffer
+        assert isinstance(buffer, OfflineReplayBuffer)
+        self.policy.set_training_mode(True)  # evaluation leaves the policy in evaluation mode
+        engine = self._bound_engine(gradient_steps)
+        generator, specs = self._training_generator(), self.noise_specs(batch_size)
+        dtype = next(self.policy.parameters()).dtype
+        for storage in engine.state.storages.values():
+            storage.set_learning_rate(self.lr_schedule(self._current_progress_remaining))
+        for _ in range(gradient_steps):
+            rows = buffer.size()
+            indices = th.randint(rows, (batch_size,), generator=generator, device=self.device)
+            batch = buffer.gather(indices, self._vec_normalize_env)
+            if dtype != th.float32:
+                batch = batch._replace(**{k: v.to(dtype) for k, v in batch._asdict().items() if v is not None})
+            noise = {name: spec.draw(generator, self.device, dtype) for name, spec in specs.items()}
+            engine.step(batch, noise, self._coefficient_tensors(dtype), **self.update_variant(self._n_updates))
+            self._n_updates += 1
+
+    def _bound_engine(self, gradient_steps: int) -> Engine:
+        """The engine, made anew when the modules' tensors were replaced (loading, ``set_parameters``, ``to``)."""
+        if self._engine is None or not self._engine.state.is_bound():
+            metrics = None if self._engine is None else self._engine.metrics
+            storages = self.make_storages()
+            planned = max(getattr(self, "_total_timesteps", 0) - self.num_timesteps, gradient_steps)
+            self._engine = Engine(
+                self.make_update(storages), TrainState(storages), choose_execution(self.execution, planned)
+            )
+            self._engine.metrics = metrics or self._engine.metrics
+        return self._engine
+
+    def _coefficient_tensors(self, dtype: th.dtype) -> dict[str, th.Tensor]:
+        for name, value in self.coefficients(self._n_updates).items():
+            if name not in self._coef or self._coef[name].dtype != dtype:
+                self._coef[name] = th.tensor(value, dtype=dtype, device=self.device)
+            else:
+                # In place: a compiled or captured step reads the tensor, not a number baked in when it was traced.
+                self._coef[name].fill_(value)
+        return self._coef
+
+    def learn(
+        self: SelfOffline,
+        total_timesteps: int | float,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 1000,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfOffline:
+        """
+        Train on the dataset.
+
+        :param total_timesteps: gradient steps; ``1e6`` is accepted
+        :param callback: called after every gradient step
+        :param log_interval: gradient steps between two log rows; ``None`` logs nothing by itself
+        :param tb_log_name: name of the TensorBoard run, default the class name
+        :param reset_num_timesteps: start counting timesteps from 0; ``_n_updates``, which drives beta, always goes on
+        :param progress_bar: show a progress bar
+        :return: the model itself
+        :raises ConfigError: without data, or if a callback's frequency is no multiple of ``gradient_steps``
+        :raises DivergenceError: if a loss is not finite
+        """
+        total_timesteps, callback = self._setup_learn(
+            int(total_timesteps), callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
+        )
+        self._check_frequencies(callback, log_interval)
+        callback.on_training_start(locals(), globals())
+        keep_going = True
+        while keep_going and self.num_timesteps < total_timesteps:
+            chunk = min(self.gradient_steps, total_timesteps - self.num_timesteps)
+            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+            self.train(gradient_steps=chunk, batch_size=self.batch_size)
+            keep_going = self._count_steps(chunk, callback, log_interval)
+        callback.on_training_end()
+        return self
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if total_timesteps < 0:
+            raise ConfigError(
+                f"total_timesteps must be >= 0 gradient steps, got {total_timesteps}", key="total_timesteps", hint="Try 1e5."
+            )
+        self.attach_dataset()
+        if self.env is None:
+            self.set_env(SpacesEnv(self.observation_space, self.action_space))
+        self._metrics_read_at = (time.time_ns(), self._n_updates)
+        return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+
+    def _check_frequencies(self, callback: BaseCallback, log_interval: int | None) -> None:
+        if log_interval is not None:
+            check_number("log_interval", log_interval, 1, integer=True, hint="It counts gradient steps; None logs nothing.")
+        if self.gradient_steps == 1:
+            return
+        frequencies = {"log_interval": log_interval} if log_interval else {}
+        for name, value in [*frequencies.items(), *callback_frequencies(callback)]:
+            if value and value > 0 and value % self.gradient_steps != 0:
+                raise ConfigError(
+                    f"{name}={value} is no multiple of gradient_steps={self.gradient_steps}",
+                    key=name,
+                    hint="Make it one, or set gradient_steps=1: otherwise a callback would see more updates than it counts.",
+                )
+
+    def _count_steps(self, n_steps: int, callback: BaseCallback, log_interval: int | None) -> bool:
+        """
+        Count gradient steps and call the callback once for each.
+
+        :return: False once the callback has asked to stop; the counters never lag behind the updates
+        """
+        # Names that Stable-Baselines3's callbacks look for among the locals of a rollout.
+        assert self.env is not None
+        new_obs, infos = self._last_obs, [{}] * self.env.num_envs
+        rewards, dones = np.zeros(self.env.num_envs), np.zeros(self.env.num_envs, dtype=bool)
+        keep_going = True
+        for _ in range(n_steps):
+            self.num_timesteps += 1
+            log_due = log_interval is not None and self.num_timesteps % log_interval == 0
+            if log_due or self.num_timesteps % GUARD_INTERVAL == 0:
+                self._record_metrics()
+            if keep_going:
+                callback.update_locals(locals())
+                keep_going = bool(callback.on_step())
+                if log_due:
+                    self.dump_logs()
+        del new_obs, infos, rewards, dones
+        return keep_going
+
+    def read_metrics(self) -> dict[str, float]:
+        """
+        Mean of every diagnostic since the last call, read from the device.
+
+        :return: name -> value, the names of the log without ``train/``; empty before the first update
+        :raises DivergenceError: if one is not finite
+        """
+        if self._engine is None:
+            return {}
+        means = self._engine.metrics.read()
+        then, updates_then = getattr(self, "_metrics_read_at", (time.time_ns(), 0))
+        refuse_divergence(means, updates_then, self._n_updates)
+        if not means:
+            return {}
+        now = time.time_ns()
+        seconds = max((now - then) / 1e9, sys.float_info.epsilon)
+        means["sec_per_1000"] = 1000.0 * seconds / max(self._n_updates - updates_then, 1)
+        self._metrics_read_at = (now, self._n_updates)
+        return {**means, **self.derived_metrics(means)}
+
+    def _record_metrics(self) -> None:
+        metrics = self.read_metrics()
+        for name, value in metrics.items():
+            self.logger.record(f"train/{name}", value)
+        self.logger.record("train/learning_rate", self.lr_schedule(self._current_progress_remaining))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self._warn_of_large_values(metrics)
+
+    def _warn_of_large_values(self, metrics: dict[str, float]) -> None:
+        if self._warned_large_q or self.dataset_statistics is None or self.gamma >= 1.0:
+            return
+        largest = self._reward_factor() * self.dataset_statistics["reward_abs_max"] + abs(self.reward_shift)
+        bound = 10.0 * largest / (1.0 - self.gamma)
+        if abs(metrics.get("q_data", 0.0)) > bound:
+            self._warned_large_q = True
+            warnings.warn(
+                f"mean Q on the data is {metrics['q_data']:.3g} after {self._n_updates} updates, beyond 10 times the largest "
+                f"return the rewards allow ({bound:.3g}): the critics are diverging. Try a larger beta or a smaller "
+                "learning_rate.",
+                SB3DCEWarning,
+            )
+
+    def dump_logs(self) -> None:
+        """Write one log row: gradient steps per second, elapsed seconds, timesteps."""
+        elapsed = max((time.time_ns() - self.start_time) / 1e9, sys.float_info.epsilon)
+        fps = int((self.num_timesteps - self._num_timesteps_at_start) / elapsed)
+        self.logger.record("time/fps", fps)
+        self.logger.record("time/time_elapsed", int(elapsed), exclude="tensorboard")
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(step=self.num_timesteps)

@@ -1,0 +1,251 @@
+"""Replay buffer whose storage is one float32 row matrix on the training device."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.preprocessing import get_action_dim, get_obs_shape
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.utils import get_device
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_dce.data.transitions import Transitions
+from sb3_dce.errors import ConfigError, DatasetFormatError
+
+# Rows handled at once when a column has to be rewritten; 64k rows of HalfCheetah are 10 MB.
+CHUNK_ROWS = 65_536
+
+
+class OfflineReplayBuffer(ReplayBuffer):
+    """
+    Stable-Baselines3's replay buffer with the rows ``observation | action | reward | done | next observation``.
+
+    Nothing is allocated until a dataset is attached or the first transition is added, so that loading a saved model costs
+    no memory. A batch is one gather. ``observations``, ``actions``, ... are views of the rows with the shapes
+    Stable-Baselines3 gives them, ``(rows, n_envs, ...)``; on a CPU they share the memory.
+
+    :param buffer_size: capacity for :meth:`add`; an attached dataset sets its own
+    :param observation_space: observation space
+    :param action_space: action space
+    :param device: where the rows lie
+    :param n_envs: number of environments, 1
+    :param optimize_memory_usage: must be False
+    :param handle_timeout_termination: keep time limits apart from true ends, must be True
+    """
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space,
+        action_space: spaces.Space,
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+    ) -> None:
+        if n_envs != 1 or optimize_memory_usage or not handle_timeout_termination:
+            raise ConfigError(
+                "OfflineReplayBuffer needs n_envs=1, optimize_memory_usage=False and handle_timeout_termination=True",
+                hint="Leave these arguments at their defaults.",
+            )
+        # ReplayBuffer.__init__ would allocate the full buffer: only its plain attributes are set here.
+        self.buffer_size = max(int(buffer_size), 1)
+        self.observation_space = observation_space
+        self.action_space = action_space
+        self.obs_shape = get_obs_shape(observation_space)  # type: ignore[assignment]
+        self.action_dim = get_action_dim(action_space)
+        self.n_envs = n_envs
+        self.optimize_memory_usage = optimize_memory_usage
+        self.handle_timeout_termination = handle_timeout_termination
+        self.obs_dim = int(np.prod(self.obs_shape))
+        self.pos = 0
+        self.full = False
+        self._device = get_device(device)
+        self.rows: th.Tensor | None = None
+        self._timeouts: np.ndarray | None = None
+
+    # -- storage -------------------------------------------------------------------------------------------------
+
+    @property
+    def device(self) -> th.device:  # type: ignore[override]
+        """
+        :return: device of the rows; assigning moves them
+        """
+        return self._device
+
+    @device.setter
+    def device(self, device: th.device | str) -> None:
+        self._device = get_device(device)
+        if self.rows is not None:
+            self.rows = self.rows.to(self._device)
+
+    def attach(self, transitions: Transitions) -> None:
+        """
+        Take over a dataset: on a CPU without a copy, unless its actions have to be rescaled to [-1, 1].
+
+        :param transitions: dataset with this buffer's observation and action widths
+        :raises DatasetFormatError: if the widths differ
+        """
+        got = (int(np.prod(transitions.obs_shape)), transitions.act_dim)
+        if got != (self.obs_dim, self.action_dim):
+            raise DatasetFormatError(
+                f"the dataset has observations of width {got[0]} and actions of width {got[1]}, "
+                f"the model wants {self.obs_dim} and {self.action_dim}",
+                where=str(transitions.info.path or transitions.info.id),
+                hint="Use the environment the data were recorded in, or another dataset.",
+            )
+        rows = th.from_numpy(transitions._base_rows)
+        self.rows = self._with_scaled_actions(rows).to(self._device)
+        self._timeouts = transitions.timeouts
+        self.buffer_size, self.pos, self.full = len(rows), 0, True
+
+    def _with_scaled_actions(self, rows: th.Tensor) -> th.Tensor:
+        space = self.action_space
+        assert isinstance(space, spaces.Box)
+        low, high = (th.as_tensor(bound, dtype=th.float32).reshape(-1) for bound in (space.low, space.high))
+        if bool((low == -1.0).all()) and bool((high == 1.0).all()):
+            return rows
+        rows = rows.clone()
+        columns = rows[:, self.obs_dim : self.obs_dim + self.action_dim]
+        for chunk in columns.split(CHUNK_ROWS):
+            chunk.copy_(2.0 * (chunk - low) / (high - low) - 1.0)
+        return rows
+
+    def _allocate(self) -> th.Tensor:
+        self.rows = th.zeros((self.buffer_size, 2 * self.obs_dim + self.action_dim + 2), device=self._device)
+        self._timeouts = np.zeros(self.buffer_size, dtype=bool)
+        return self.rows
+
+    def reset(self) -> None:
+        """Forget all rows."""
+        super().reset()
+        self.rows = self._timeouts = None
+
+    # -- Stable-Baselines3's interface -----------------------------------------------------------------------------
+
+    def add(
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """
+        Store one transition, over the oldest one when the buffer is full.
+
+        :param obs: shape (1, *obs_shape)
+        :param next_obs: shape (1, *obs_shape)
+        :param action: scaled to [-1, 1], shape (1, action_dim)
+        :param reward: shape (1,)
+        :param done: shape (1,); an end by time limit is recognised by ``infos``
+        :param infos: one dict, ``TimeLimit.truncated`` marks a time limit
+        """
+        rows = self._allocate() if self.rows is None else self.rows
+        assert self._timeouts is not None
+        if not self._timeouts.flags.writeable:  # the attached dataset's own array
+            self._timeouts = self._timeouts.copy()
+        timeout = bool(infos[0].get("TimeLimit.truncated", False))
+        parts = (obs, action, reward, np.asarray(done) & (not timeout), next_obs)
+        row = np.concatenate([np.asarray(part, dtype=np.float32).reshape(-1) for part in parts])
+        rows[self.pos] = th.as_tensor(row, device=self._device)
+        self._timeouts[self.pos] = timeout
+        self.pos += 1
+        if self.pos == self.buffer_size:
+            self.full, self.pos = True, 0
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        """
+        Draw rows uniformly with replacement, with NumPy's global generator as Stable-Baselines3 does.
+
+        Training draws its indices from the model's own generator and calls :meth:`gather`.
+
+        :param batch_size: number of rows
+        :param env: normalises observations and rewards
+        :return: tensors on the buffer's device
+        """
+        return self.gather(th.as_tensor(np.random.randint(0, self.size(), size=batch_size), device=self._device), env)
+
+    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        return self.gather(th.as_tensor(batch_inds, device=self._device), env)
+
+    def gather(self, indices: th.Tensor, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        """
+        :param indices: row numbers, shape (batch,)
+        :param env: normalises observations and rewards
+        :return: tensors of shape (batch, ...); ``dones`` is 1 only at true terminals
+        """
+        assert self.rows is not None, "the buffer is empty"
+        obs, action, reward, done, next_obs = self._columns(self.rows.index_select(0, indices))
+        shape = (len(indices), *self.obs_shape)
+        obs, next_obs = obs.reshape(shape), next_obs.reshape(shape)
+        if env is not None:
+            obs, next_obs = (self._through_numpy(env.normalize_obs, o) for o in (obs, next_obs))
+            reward = self._through_numpy(env.normalize_reward, reward)
+        return ReplayBufferSamples(obs, action, next_obs, done, reward)
+
+    def _through_numpy(self, function: Any, tensor: th.Tensor) -> th.Tensor:
+        return th.as_tensor(function(tensor.cpu().numpy()), dtype=th.float32, device=self._device)
+
+    def _columns(self, rows: th.Tensor) -> tuple[th.Tensor, ...]:
+        return rows.split([self.obs_dim, self.action_dim, 1, 1, self.obs_dim], dim=1)
+
+    def _view(self, column: int, *shape: int) -> np.ndarray:
+        if self.rows is None:
+            return np.zeros((0, self.n_envs, *shape), dtype=np.float32)
+        return self._columns(self.rows)[column].cpu().numpy().reshape(len(self.rows), self.n_envs, *shape)
+
+    @property
+    def observations(self) -> np.ndarray:  # type: ignore[override]
+        """
+        :return: shape (rows, 1, *obs_shape)
+        """
+        return self._view(0, *self.obs_shape)
+
+    @property
+    def actions(self) -> np.ndarray:  # type: ignore[override]
+        """
+        :return: scaled to [-1, 1], shape (rows, 1, action_dim)
+        """
+        return self._view(1, self.action_dim)
+
+    @property
+    def rewards(self) -> np.ndarray:  # type: ignore[override]
+        """
+        :return: shape (rows, 1)
+        """
+        return self._view(2)
+
+    @property
+    def dones(self) -> np.ndarray:  # type: ignore[override]
+        """
+        :return: 1 at true terminals, shape (rows, 1)
+        """
+        return self._view(3)
+
+    @property
+    def next_observations(self) -> np.ndarray:  # type: ignore[override]
+        """
+        :return: shape (rows, 1, *obs_shape)
+        """
+        return self._view(4, *self.obs_shape)
+
+    @property
+    def timeouts(self) -> np.ndarray:  # type: ignore[override]
+        """
+        :return: 1 where an episode was cut by its time limit, shape (rows, 1)
+        """
+        if self._timeouts is None:
+            return np.zeros((0, self.n_envs), dtype=np.float32)
+        return self._timeouts.astype(np.float32).reshape(-1, self.n_envs)
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = self.__dict__.copy()
+        state["rows"] = None if self.rows is None else self.rows.cpu()
+        state["_device"] = th.device("cpu")
+        return state

@@ -1,0 +1,72 @@
+"""Checks of constructor arguments and callbacks, with messages that name the value, what is allowed and the remedy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
+
+from sb3_dce.errors import ConfigError
+
+
+def check_number(
+    name: str,
+    value: Any,
+    low: float,
+    high: float = float("inf"),
+    *,
+    open_low: bool = False,
+    open_high: bool = False,
+    integer: bool = False,
+    hint: str | None = None,
+) -> None:
+    """
+    :param name: name of the parameter
+    :param value: what the user gave
+    :param low: smallest allowed value
+    :param high: largest allowed value
+    :param open_low: ``low`` itself is not allowed
+    :param open_high: ``high`` itself is not allowed
+    :param integer: only whole numbers are allowed
+    :param hint: what to do
+    :raises ConfigError: if the value is outside
+    """
+    kinds = (int, np.integer) if integer else (int, float, np.integer, np.floating)
+    ok = isinstance(value, kinds) and not isinstance(value, bool)
+    ok = ok and (value > low if open_low else value >= low) and (value < high if open_high else value <= high)
+    if not ok:
+        interval = f"{'(' if open_low else '['}{low:g}, {high:g}{')' if open_high or high == float('inf') else ']'}"
+        kind = "an integer" if integer else "a number"
+        raise ConfigError(f"{name} must be {kind} in {interval}, got {value!r}", key=name, hint=hint)
+
+
+def check_choice(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
+    """
+    :param name: name of the parameter
+    :param value: what the user gave
+    :param allowed: allowed values
+    :raises ConfigError: if the value is none of them
+    """
+    if value not in allowed:
+        raise ConfigError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}", key=name)
+
+
+def callback_frequencies(callback: BaseCallback) -> list[tuple[str, int]]:
+    """
+    :param callback: callback, or a list or chain of them
+    :return: name and value of every frequency in it, in timesteps
+    """
+    found = [
+        (f"{type(callback).__name__}.{name}", getattr(callback, name))
+        for name in ("eval_freq", "save_freq", "n_steps")
+        if isinstance(getattr(callback, name, None), int)
+    ]
+    children: list[BaseCallback | None] = []
+    if isinstance(callback, CallbackList):
+        children = list(callback.callbacks)
+    elif isinstance(callback, EventCallback):
+        children = [callback.callback, getattr(callback, "callback_on_new_best", None)]
+    for child in children:
+        found += [] if child is None else callback_frequencies(child)
+    return found

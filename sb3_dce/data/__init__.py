@@ -1,0 +1,27 @@
+"""Offline datasets: a catalogue of names, a safe reader of D4RL files, and the transitions that training uses."""
+
+from sb3_dce.data.catalog import DatasetSpec, all_specs, normalized_score, resolve, spec_of_file
+from sb3_dce.data.hashes import content_hash, file_sha256
+from sb3_dce.data.hdf5 import D4RLFile, write_hdf5
+from sb3_dce.data.loading import load_transitions
+from sb3_dce.data.locate import available, find_file
+from sb3_dce.data.records import DatasetInfo, ReadOptions
+from sb3_dce.data.transitions import Transitions
+
+__all__ = [
+    "D4RLFile",
+    "DatasetInfo",
+    "DatasetSpec",
+    "ReadOptions",
+    "Transitions",
+    "all_specs",
+    "available",
+    "content_hash",
+    "file_sha256",
+    "find_file",
+    "load_transitions",
+    "normalized_score",
+    "resolve",
+    "spec_of_file",
+    "write_hdf5",
+]

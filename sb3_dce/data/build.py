@@ -1,0 +1,221 @@
+"""
+From arrays, wherever they come from, to the row matrix that training uses.
+
+The peak of memory is the row matrix itself plus a few bytes per row: arrays are read in blocks straight into their columns,
+and rows that are not used are squeezed out in place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_dce.data.catalog import DatasetSpec
+from sb3_dce.data.columns import ColumnSummary, copy_columns
+from sb3_dce.data.episodes import Episodes, d4rl_rows, fill_next_observations, find_episodes, usable_rows
+from sb3_dce.data.layout import ArraySource, RowLayout, check_layout, read_flags, row_blocks
+from sb3_dce.data.quality import (
+    Findings,
+    check_actions,
+    check_duplicates,
+    check_episodes,
+    check_finite,
+    check_flags,
+    check_observations,
+    check_order,
+)
+from sb3_dce.data.records import DatasetInfo, ReadOptions
+from sb3_dce.errors import DatasetSecurityError, DatasetSemanticsError
+
+MAX_SHARE_OF_FREE_MEMORY = 0.8
+
+
+class BuiltRows(NamedTuple):
+    """
+    The result of :func:`build_rows`.
+
+    :param rows: row matrix, shape (rows, width), float32
+    :param layout: its columns
+    :param timeouts: True where an episode ends without a terminal, shape (rows,)
+    :param episodes: number of the episode, shape (rows,), int32
+    :param info: facts about the dataset
+    """
+
+    rows: np.ndarray
+    layout: RowLayout
+    timeouts: np.ndarray
+    episodes: np.ndarray
+    info: DatasetInfo
+
+
+def build_rows(
+    sources: Mapping[str, ArraySource],
+    *,
+    dataset_id: str,
+    path: Path | None,
+    found_keys: Iterable[str],
+    spec: DatasetSpec | None,
+    options: ReadOptions,
+) -> BuiltRows:
+    """
+    Read, check and arrange a dataset.
+
+    :param sources: core keys to arrays
+    :param dataset_id: name of the dataset
+    :param path: file, None for arrays
+    :param found_keys: all keys of the file, for messages
+    :param spec: entry of the catalogue, if there is one
+    :param options: see :class:`ReadOptions`
+    :return: row matrix and facts
+    :raises DatasetError: if something is wrong with the dataset
+    """
+    where = dataset_id if path is None else str(path)
+    layout = check_layout(
+        sources, where=where, found_keys=found_keys, spec=spec, obs_dim=options.obs_dim, act_dim=options.act_dim
+    )
+    has_next = "next_observations" in sources
+    uses_next = has_next and not options.d4rl_compat
+    findings = Findings()
+
+    terminals = read_flags(sources["terminals"], "terminals", where)
+    timeouts = read_flags(sources["timeouts"], "timeouts", where) if "timeouts" in sources else None
+    check_flags(terminals, timeouts, findings)
+    limit = options.max_episode_steps or (spec.max_episode_steps if spec else None)
+    if options.d4rl_compat and timeouts is None and limit is None:
+        raise DatasetSemanticsError(
+            "d4rl_compat needs the time limit of the environment, because there is no timeouts key",
+            where=where,
+            hint="Pass max_episode_steps=",
+            key="timeouts",
+        )
+
+    rows = _allocate(len(terminals), layout.width, where)
+    rows[:, layout.terminals] = terminals[:, None]
+    keys = ("observations", "actions", "rewards", *(["next_observations"] if uses_next else []))
+    summaries = {key: copy_columns(sources[key], rows[:, getattr(layout, key)], key, where) for key in keys}
+
+    jumps = check_order(rows, layout, terminals, timeouts, findings, where) if uses_next else None
+    if not uses_next:
+        fill_next_observations(rows, layout, None if options.d4rl_compat else terminals)
+    # Kitchen's terminals mark the end of every demonstration: its time limit is that of the evaluation.
+    counts_steps = options.max_episode_steps is not None or spec is None or spec.family != "kitchen"
+    episodes = find_episodes(terminals, timeouts, limit if counts_steps else None, jumps)
+    if options.d4rl_compat:
+        used = d4rl_rows(terminals, timeouts, limit)
+    else:
+        used = usable_rows(episodes, terminals, uses_next)
+    _require_rows(used, where)
+    check_episodes(episodes, int(not used[-1]), timeouts is not None, spec.max_episode_steps if spec else None, findings)
+
+    bad = check_finite(summaries.values(), rows, used, options.drop_nonfinite, where)
+    if bad is not None:
+        used &= ~bad
+        findings.notes.append(f"{int(bad.sum())} rows with NaN or infinite values were dropped")
+        _require_rows(used, where)
+    _check_content(rows, layout, summaries, sources, findings)
+    action_low, action_high = check_actions(rows[:, layout.actions], summaries["actions"], options, findings, where)
+    returns = episodes.returns(rows[:, layout.rewards.start])
+    whole = _whole_episodes(episodes, returns, bad)
+    if "-cloned-" not in dataset_id:  # D4RL fills these up with copies of the demonstrations
+        check_duplicates(rows, findings)
+
+    file_rows = len(rows)
+    rows = _squeeze(rows, used)
+    rewards = rows[:, layout.rewards]
+    info = DatasetInfo(
+        id=dataset_id,
+        path=path,
+        file_rows=file_rows,
+        rows=len(rows),
+        episodes=int(whole.sum()),
+        episode_returns=returns[whole],
+        episode_lengths=episodes.lengths[whole],
+        n_terminals=int(terminals.sum()),
+        n_timeouts=int(episodes.timeouts.sum()),
+        open_last_episode=episodes.open_last,
+        dropped_rows=file_rows - len(rows),
+        episode_rule=episodes.rule,
+        has_next_observations=has_next,
+        d4rl_compat=options.d4rl_compat,
+        reward_mean=float(rewards.mean(dtype=np.float64)),
+        reward_min=float(rewards.min()),
+        reward_max=float(rewards.max()),
+        action_low=action_low,
+        action_high=action_high,
+        notes=tuple(findings.notes),
+        warnings=tuple(findings.warnings),
+    )
+    return BuiltRows(rows, layout, episodes.timeouts[used], episodes.index[used], info)
+
+
+def _allocate(n_rows: int, width: int, where: str) -> np.ndarray:
+    needed = 4 * n_rows * width
+    free = _free_memory()
+    if free is None or needed <= MAX_SHARE_OF_FREE_MEMORY * free:
+        try:
+            return np.empty((n_rows, width), dtype=np.float32)
+        except MemoryError:
+            pass
+    raise DatasetSecurityError(
+        f"{n_rows:,} rows need {needed:,} bytes of memory, {'too many' if free is None else f'{free:,}'} are free",
+        where=where,
+        hint="Use part of the data: memory-mapped arrays can be sliced and given to Transitions.from_arrays",
+        count=n_rows,
+    )
+
+
+def _free_memory() -> int | None:
+    """Bytes that can be had without swapping, None where the system does not say."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
+    except (OSError, StopIteration):
+        return None
+
+
+def _require_rows(used: np.ndarray, where: str) -> None:
+    n_used = int(used.sum())
+    if len(used) < 2 or n_used == 0:
+        raise DatasetSemanticsError(
+            f"{len(used)} rows, {n_used} usable after the episode rule",
+            where=where,
+            hint="Add next_observations, or longer episodes: without them the last row of an episode has no next observation",
+            count=n_used,
+        )
+
+
+def _check_content(
+    rows: np.ndarray,
+    layout: RowLayout,
+    summaries: Mapping[str, ColumnSummary],
+    sources: Mapping[str, ArraySource],
+    findings: Findings,
+) -> None:
+    check_observations(summaries["observations"], sources["observations"].dtype.kind in "iu", findings)
+    reward = summaries["rewards"]
+    if reward.low[0] == reward.high[0]:
+        findings.warnings.append(f"the reward is constant, {reward.low[0]:g}: there is nothing to learn from")
+
+
+def _whole_episodes(episodes: Episodes, returns: np.ndarray, bad: np.ndarray | None) -> np.ndarray:
+    """Episodes that are neither open nor short of a row with NaN or infinity, shape (n_episodes,), bool."""
+    whole = np.isfinite(returns)
+    whole[-1] &= not episodes.open_last
+    if bad is not None:
+        whole[episodes.index[bad]] = False
+    return whole
+
+
+def _squeeze(rows: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Move the used rows to the front, in place and in order. The memory behind them stays allocated."""
+    end = 0
+    if used.all():
+        return rows
+    for block in row_blocks(len(rows)):
+        chosen = rows[block][used[block]]
+        rows[end : end + len(chosen)] = chosen
+        end += len(chosen)
+    return rows[:end]

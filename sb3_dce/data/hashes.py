@@ -1,0 +1,44 @@
+"""Hashes: of the numbers of a dataset, and of the bytes of a file."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from os import PathLike
+
+import numpy as np
+
+from sb3_dce.data.layout import CORE_KEYS, ArraySource, row_blocks
+
+
+def content_hash(arrays: Mapping[str, ArraySource]) -> str:
+    """
+    Hash of the numbers, independent of compression and of keys that training does not read.
+
+    SHA-256 over the core keys in sorted order, each as name, type, shape and little-endian bytes in C order.
+
+    :param arrays: key to array, of NumPy or of an open file
+    :return: 64 hexadecimal digits
+    """
+    digest = hashlib.sha256()
+    for key in sorted(set(CORE_KEYS) & set(arrays)):
+        array = arrays[key]
+        dtype = np.dtype(array.dtype).newbyteorder("<")
+        digest.update(f"{key}|{dtype.str}|{tuple(array.shape)}|".encode())
+        for rows in row_blocks(array.shape[0]):
+            digest.update(np.ascontiguousarray(array[rows], dtype=dtype).data)
+    return digest.hexdigest()
+
+
+def file_sha256(path: str | PathLike[str]) -> str:
+    """
+    Hash of the bytes of a file.
+
+    :param path: file
+    :return: SHA-256, 64 hexadecimal digits
+    """
+    digest = hashlib.sha256()
+    with open(path, "rb") as file:
+        while block := file.read(2**20):
+            digest.update(block)
+    return digest.hexdigest()

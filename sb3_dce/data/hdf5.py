@@ -1,0 +1,251 @@
+"""
+HDF5 files in the layout of D4RL: flat arrays, one row per step. The only importer of h5py.
+
+A dataset file comes from the internet, so it is treated as hostile. HDF5 can point into other files of the machine (soft and
+external links, external storage, virtual datasets), can load filter plugins, and can declare terabytes in a kilobyte; h5py
+follows all of this silently. Here such files are refused before the first number is read.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from os import PathLike
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import h5py
+import numpy as np
+
+from sb3_dce.data.file_checks import not_hdf5, read_head, translated_errors
+from sb3_dce.data.layout import BLOCK_ROWS
+from sb3_dce.errors import DatasetFormatError, DatasetIntegrityError, DatasetSecurityError
+from sb3_dce.files import write_atomically
+
+ALLOWED_FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}
+DEFAULT_MAX_BYTES = 8 * 2**30
+MAX_DEPTH = 16
+MAX_OBJECTS = 10_000
+# Honest arrays exceed any flat ratio (a million False compress 411:1), so only large ones are judged by it.
+MAX_RATIO = 200
+RATIO_APPLIES_ABOVE = 256 * 2**20
+
+
+class HDF5Array:
+    """
+    One array of an open file, read in blocks of rows.
+
+    :param dataset: array that has passed the checks of :class:`D4RLFile`
+    :param path: file, for messages
+    """
+
+    def __init__(self, dataset: h5py.Dataset, path: Path) -> None:
+        self._dataset, self._path, self._key = dataset, path, dataset.name.strip("/")
+        with translated_errors(path, self._key):
+            self.shape: tuple[int, ...] = dataset.shape or ()  # None for an array without any value
+            self.dtype: np.dtype = dataset.dtype
+        # A multiple of the chunk: h5py would decompress a chunk once for each block that touches it.
+        chunk_rows = dataset.chunks[0] if dataset.chunks else 1
+        self.block_rows = chunk_rows * max(1, BLOCK_ROWS // chunk_rows)
+
+    def __getitem__(self, rows: slice) -> np.ndarray:
+        """
+        :param rows: rows to read
+        :return: shape (len(rows), ...), in the type of the file
+        """
+        with translated_errors(self._path, self._key):
+            block: np.ndarray = self._dataset[rows]
+        return block
+
+
+class D4RLFile:
+    """
+    An HDF5 file, opened read-only and checked.
+
+    Entering checks that it is HDF5 and that all its links are hard ones; :meth:`select` checks the wanted arrays; leaving
+    checks that the file has not changed meanwhile.
+
+    :param path: file
+    :param max_bytes: largest total size of the selected arrays, uncompressed
+    :param url: where the file can be downloaded again, for messages
+    """
+
+    def __init__(self, path: str | PathLike[str], *, max_bytes: int = DEFAULT_MAX_BYTES, url: str | None = None) -> None:
+        self.path = Path(path)
+        self.max_bytes = max_bytes
+        self._again = f"Download it again: {url}" if url else "Download or copy it again"
+        self.keys: tuple[str, ...] = ()
+
+    def __enter__(self) -> D4RLFile:
+        head = read_head(self.path)
+        with translated_errors(self.path, hint=self._again):
+            self._stat = os.stat(self.path)
+            try:
+                self._file = h5py.File(self.path, "r", locking="best-effort", rdcc_nbytes=0)  # whole chunks are read
+            except OSError as exc:
+                raise not_hdf5(self.path, head, self._again) from exc
+        try:
+            with translated_errors(self.path, hint=self._again):
+                self.keys = tuple(_walk(self._file, self.path))
+        except BaseException:
+            self._file.close()
+            raise
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None) -> None:
+        with translated_errors(self.path, hint=self._again):
+            self._file.close()
+            now = os.stat(self.path)
+        before = self._stat
+        changed = (now.st_size, now.st_mtime_ns, now.st_ino) != (before.st_size, before.st_mtime_ns, before.st_ino)
+        if changed and error is None:
+            raise DatasetIntegrityError(
+                "the file changed while it was read",
+                where=str(self.path),
+                hint="Wait until the program that writes it has finished",
+                path=self.path,
+            )
+
+    def attributes(self) -> dict[str, Any]:
+        """
+        Scalar attributes of the root, written by this package into the data it makes.
+
+        :return: name to number or text
+        """
+        with translated_errors(self.path, "root attributes"):
+            attrs = self._file.attrs
+            return {name: attrs[name] for name in attrs if attrs.get_id(name).shape == ()}
+
+    def select(self, names: Iterable[str]) -> dict[str, HDF5Array]:
+        """
+        Those of the named arrays that are in the file, checked but not read.
+
+        :param names: top-level keys; missing ones are left out
+        :return: name to array
+        :raises DatasetFormatError: if a key is a group
+        :raises DatasetSecurityError: if an array lies in another file, needs a filter that is not built in, or is too large
+        """
+        with translated_errors(self.path):
+            chosen = {name: self._file[name] for name in names if name in self._file}
+            groups = [name for name, item in chosen.items() if not isinstance(item, h5py.Dataset)]
+            if groups:
+                raise DatasetFormatError(
+                    f"{', '.join(groups)} should be an array but is a group or a type",
+                    where=str(self.path),
+                    hint="D4RL's layout is flat, one array per key, one row per step",
+                    path=self.path,
+                    key=groups[0],
+                )
+            for name, dataset in chosen.items():
+                _check_storage(dataset, name, self.path)
+            self._check_size(chosen)
+        return {name: HDF5Array(dataset, self.path) for name, dataset in chosen.items()}
+
+    def _check_size(self, chosen: Mapping[str, h5py.Dataset]) -> None:
+        declared = {name: dataset.size * dataset.dtype.itemsize for name, dataset in chosen.items() if dataset.shape}
+        stored = {name: chosen[name].id.get_storage_size() for name in declared}
+        total, total_stored = sum(declared.values()), sum(stored.values())
+        if total > self.max_bytes:
+            raise DatasetSecurityError(
+                f"the arrays declare {total:,} bytes ({total_stored:,} stored, ratio {total / max(total_stored, 1):.0f}), "
+                f"the limit is {self.max_bytes:,}",
+                where=str(self.path),
+                hint=f"If the file is honest, pass max_bytes={total}, or take part of it: memory-mapped arrays can be sliced "
+                "and given to Transitions.from_arrays",
+                path=self.path,
+                key=max(declared, key=lambda name: declared[name]),
+            )
+        for name, size in declared.items():
+            if size > RATIO_APPLIES_ABOVE and size > MAX_RATIO * stored[name]:
+                raise DatasetSecurityError(
+                    f"declares {size:,} bytes but stores {stored[name]:,}, ratio {size / max(stored[name], 1):.0f}; "
+                    f"data of this size do not compress beyond {MAX_RATIO}",
+                    where=f"{self.path}, key {name}",
+                    hint="Rewrite the file without compression if it is honest",
+                    path=self.path,
+                    key=name,
+                )
+
+
+def write_hdf5(
+    path: str | PathLike[str],
+    arrays: Mapping[str, np.ndarray],
+    attrs: Mapping[str, Any] | None = None,
+    *,
+    compression_level: int = 6,
+) -> None:
+    """
+    Write arrays in D4RL's layout with gzip, shuffle and the checksum fletcher32. An existing file is replaced only when the
+    new one is complete.
+
+    :param path: file to write
+    :param arrays: key to array, shape (n, ...)
+    :param attrs: attributes of the root
+    :param compression_level: of gzip, 0 to 9
+    """
+    with write_atomically(Path(path)) as stream, h5py.File(stream, "w") as file:
+        file.attrs.update(attrs or {})
+        for key, array in arrays.items():
+            file.create_dataset(
+                key, data=array, compression="gzip", compression_opts=compression_level, shuffle=True, fletcher32=True
+            )
+
+
+def _walk(root: h5py.Group, path: Path) -> Iterator[str]:
+    """Names of all arrays, after checking that each link on the way to them is a hard one."""
+    groups = [("", root, 1)]
+    count = 0
+    while groups:
+        prefix, group, depth = groups.pop()
+        for name in group:
+            count += 1
+            key = f"{prefix}{name}"
+            _check_link(group.get(name, getlink=True), key, path)
+            if depth > MAX_DEPTH or count > MAX_OBJECTS:
+                raise DatasetSecurityError(
+                    f"more than {MAX_DEPTH} nested groups or more than {MAX_OBJECTS:,} objects",
+                    where=f"{path}, key {key[:60]}",
+                    hint="Copy the arrays into a flat file",
+                    path=path,
+                    key=key,
+                )
+            item = group[name]
+            if isinstance(item, h5py.Group):
+                groups.append((f"{key}/", item, depth + 1))
+            elif isinstance(item, h5py.Dataset):
+                yield key
+
+
+def _check_link(link: Any, key: str, path: Path) -> None:
+    if isinstance(link, h5py.HardLink):
+        return
+    if isinstance(link, h5py.ExternalLink):
+        kind = f"an external link to file {link.filename!r}"
+    else:
+        kind = f"a soft link to {link.path!r}" if isinstance(link, h5py.SoftLink) else "a link of unknown type"
+    raise DatasetSecurityError(
+        f"{kind}; it was not followed",
+        where=f"{path}, key {key}",
+        hint="Copy the data into the file itself",
+        path=path,
+        key=key,
+    )
+
+
+def _check_storage(dataset: h5py.Dataset, name: str, path: Path) -> None:
+    """Refuse arrays whose bytes lie in other files or need a filter that is not built in."""
+    external = dataset.external
+    filters = dataset.id.get_create_plist()
+    codes = [filters.get_filter(i)[0] for i in range(filters.get_nfilters())]
+    unknown = [code for code in codes if code not in ALLOWED_FILTERS]
+    if external:
+        what, hint = f"its numbers lie in another file, {external[0][0]!r}", "Copy the data into the file itself"
+    elif dataset.is_virtual:
+        what, hint = "a virtual dataset, its numbers lie in other files", "Copy the data into the file itself"
+    elif unknown:
+        allowed = ", ".join(ALLOWED_FILTERS.values())
+        what, hint = f"needs HDF5 filter {unknown[0]}, allowed are {allowed}", "Rewrite with gzip"
+    else:
+        return
+    raise DatasetSecurityError(what, where=f"{path}, key {name}", hint=hint, path=path, key=name)

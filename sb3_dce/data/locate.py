@@ -1,0 +1,126 @@
+"""
+From a dataset name to a file on this machine. Nothing is downloaded.
+
+Searched in this order: files that come with the package, ``$SB3_DCE_DATASETS`` (several folders may be given, separated
+as in ``$PATH``), the cache ``~/.cache/sb3_dce/datasets``, and D4RL's own folders ``$D4RL_DATASET_DIR`` and
+``~/.d4rl/datasets``.
+"""
+
+from __future__ import annotations
+
+import os
+from importlib import resources
+from os import PathLike
+from pathlib import Path
+
+from sb3_dce.data.catalog import DatasetSpec, all_specs, resolve, spec_of_file
+from sb3_dce.errors import DatasetNotFoundError
+
+DATASETS_VARIABLE = "SB3_DCE_DATASETS"
+
+
+def find_file(name_or_path: str | PathLike[str]) -> tuple[Path, DatasetSpec | None]:
+    """
+    The file of a dataset.
+
+    A path (see :func:`is_path`) wins over a name. A D4RL id is never answered with a ``-sb3`` file.
+
+    :param name_or_path: file, or id or alias of the catalogue
+    :return: existing path, and the entry of the catalogue if the name or the file name is known there
+    :raises DatasetNotFoundError: if there is no such file; the message says where to put it and what is available
+    :raises DatasetError: if it is neither a path nor a known name
+    """
+    path = Path(name_or_path).expanduser()
+    if is_path(name_or_path):
+        if not path.exists():
+            raise DatasetNotFoundError("no such file", where=str(path), hint=_available_hint(), path=path)
+        return path, spec_of_file(path)
+    spec = resolve(os.fspath(name_or_path))
+    found = _search(spec)
+    if found is None:
+        raise _not_found(spec)
+    return found, spec
+
+
+def is_path(name_or_path: str | PathLike[str]) -> bool:
+    """
+    Whether a dataset is given by its file rather than by its name.
+
+    :param name_or_path: file, or id or alias of the catalogue
+    :return: True for a ``Path``, a text with a separator or ending in ``.hdf5`` or ``.h5``, and any existing file
+    """
+    if not isinstance(name_or_path, str) or name_or_path.endswith((".hdf5", ".h5")):
+        return True
+    has_separator = any(separator and separator in name_or_path for separator in (os.sep, os.altsep))
+    return has_separator or Path(name_or_path).expanduser().is_file()
+
+
+def available() -> list[tuple[DatasetSpec, Path]]:
+    """
+    The datasets of the catalogue whose file is on this machine.
+
+    :return: pairs of entry and file, in the order of the catalogue
+    """
+    return [(spec, path) for spec in all_specs() if (path := _search(spec)) is not None]
+
+
+def embedded_folder() -> Path:
+    """
+    Folder of the files that come with the package.
+
+    :return: folder, inside the installed package
+    """
+    return Path(str(resources.files("sb3_dce.data"))) / "files"
+
+
+def cache_folder() -> Path:
+    """
+    Folder in which this package keeps datasets, ``~/.cache/sb3_dce/datasets`` or its place below ``$XDG_CACHE_HOME``.
+
+    :return: folder, need not exist
+    """
+    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(base).expanduser() / "sb3_dce" / "datasets"
+
+
+def search_folders() -> list[Path]:
+    """
+    The folders in which a dataset is looked for after the files of the package, in this order.
+
+    :return: folders, need not exist
+    """
+    own = os.environ.get(DATASETS_VARIABLE, "").split(os.pathsep)
+    d4rl = os.environ.get("D4RL_DATASET_DIR", "")
+    folders = [*(Path(folder).expanduser() for folder in own if folder), cache_folder()]
+    if d4rl:
+        folders.append(Path(d4rl).expanduser())
+    return [*folders, Path("~/.d4rl/datasets").expanduser()]
+
+
+def _search(spec: DatasetSpec) -> Path | None:
+    folders = [embedded_folder()] if spec.embedded else []
+    names = dict.fromkeys((spec.file_name, f"{spec.id}.hdf5"))
+    candidates = (folder / name for folder in [*folders, *search_folders()] for name in names)
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def _not_found(spec: DatasetSpec) -> DatasetNotFoundError:
+    target = search_folders()[0] / spec.file_name
+    here = available()
+    stand_ins = [twin.id for twin, _ in here if twin.generated and twin.paper_row == spec.paper_row and twin != spec]
+    hint = f"Download {spec.url} to {target}" if spec.url else f"Put the file at {target}"
+    hint += f", or name another folder in ${DATASETS_VARIABLE}, or give the path of the file."
+    if stand_ins:
+        hint += f" Similar data made with this package, to be asked for by their own name: {', '.join(stand_ins)}."
+    return DatasetNotFoundError(
+        f"{spec.file_name} not found; searched {', '.join(map(str, search_folders()))}",
+        where=f"dataset {spec.id}",
+        hint=f"{hint} {_available_hint()}",
+        path=target,
+        key=spec.id,
+    )
+
+
+def _available_hint() -> str:
+    ids = [spec.id for spec, _ in available()]
+    return f"Available now: {', '.join(ids)}" if ids else "No dataset of the catalogue is on this machine"

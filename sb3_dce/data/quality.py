@@ -1,0 +1,233 @@
+"""
+Does the content of a dataset make sense? What would ruin training is an error, what deserves a look a warning, the rest a
+note. Each check states its threshold beside its reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sb3_dce.data.columns import ColumnSummary
+from sb3_dce.data.episodes import MAX_JUMP_SHARE, Episodes, find_jumps, find_shift
+from sb3_dce.data.layout import RowLayout, row_blocks
+from sb3_dce.data.records import ReadOptions
+from sb3_dce.errors import DatasetSemanticsError
+
+# Beyond these a loss becomes NaN, a scale is probably wrong, or data were probably joined twice.
+HUGE_VALUE = 1e6
+MAX_EXCESS = 0.01
+MAX_DUPLICATES = 0.05
+
+
+@dataclass
+class Findings:
+    """
+    What the checks found, in the order of the checks.
+
+    :param notes: worth knowing
+    :param warnings: deserve a look
+    """
+
+    notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+
+def check_finite(
+    summaries: Iterable[ColumnSummary], rows: np.ndarray, usable: np.ndarray, drop: bool, where: str
+) -> np.ndarray | None:
+    """
+    Look for NaN and infinity.
+
+    :param summaries: of all arrays that were read
+    :param rows: row matrix, next observations filled in
+    :param usable: rows that would be used, shape (rows,)
+    :param drop: whether such rows may be dropped
+    :param where: file, for messages
+    :return: usable rows with such a value, shape (rows,), None if the arrays are clean
+    :raises DatasetSemanticsError: if there are some and they may not be dropped
+    """
+    dirty = [summary for summary in summaries if summary.n_bad]
+    if not dirty:
+        return None
+    bad = np.empty(len(rows), dtype=bool)
+    for block in row_blocks(len(rows)):
+        bad[block] = ~np.isfinite(rows[block]).all(axis=1)
+    bad &= usable
+    if not drop:
+        counts = (f"{s.key} has {s.n_bad} NaN or infinite values, the first at (row, column) {s.first_bad}" for s in dirty)
+        raise DatasetSemanticsError(
+            "; ".join(counts),
+            where=where,
+            hint=f"Repair the file, or drop_nonfinite=True removes {int(bad.sum())} rows",
+            key=dirty[0].key,
+            index=dirty[0].first_bad,
+            count=sum(summary.n_bad for summary in dirty),
+        )
+    return bad
+
+
+def check_actions(
+    actions: np.ndarray, summary: ColumnSummary, options: ReadOptions, findings: Findings, where: str
+) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Compare actions with their bounds, and move small excesses onto them.
+
+    :param actions: columns of the row matrix, shape (rows, act_dim), changed in place
+    :param summary: extremes of the actions
+    :param options: bounds, and whether to clip
+    :param findings: notes and warnings
+    :param where: file, for messages
+    :return: smallest and largest action, float32, shape (act_dim,)
+    :raises DatasetSemanticsError: if actions are outside by more than 1 % of half the range and may not be clipped
+    """
+    low, high = options.action_bounds(actions.shape[1])
+    lowest, highest = summary.low.astype(np.float32), summary.high.astype(np.float32)
+    half_range = (high - low) / 2
+    excess = np.maximum(low - lowest, highest - high)
+    if excess.max() > 0:
+        n_outside = 0
+        for block in row_blocks(len(actions)):
+            outside = (actions[block] < low) | (actions[block] > high)
+            n_outside += int(outside.sum())
+        if (excess > MAX_EXCESS * half_range).any() and not options.clip_actions:
+            found = ", ".join(f"{a:g}..{b:g}" for a, b in zip(lowest, highest, strict=True))
+            raise DatasetSemanticsError(
+                f"{n_outside} action entries are outside of [{low.min():g}, {high.max():g}]; range per dimension: {found}",
+                where=f"{where}, key actions",
+                hint="Give the bounds of the action space as action_low= and action_high=, or clip_actions=True",
+                key="actions",
+                count=n_outside,
+            )
+        for block in row_blocks(len(actions)):
+            np.clip(actions[block], low, high, out=actions[block])
+        findings.warnings.append(f"{n_outside} action entries were outside of the bounds by up to {excess.max():.2g}: clipped")
+    elif _within_half(lowest, highest, low, half_range):
+        findings.notes.append("all actions lie within the inner half of their bounds: is the scale right?")
+    return np.clip(lowest, low, high), np.clip(highest, low, high)
+
+
+def check_observations(summary: ColumnSummary, is_integer: bool, findings: Findings) -> None:
+    """
+    Look for integer, constant and huge observations.
+
+    :param summary: extremes of the observations
+    :param is_integer: whether the file stores integers
+    :param findings: notes and warnings
+    """
+    if is_integer:
+        findings.warnings.append("observations are integers: cast to float32")
+    constant = np.flatnonzero(summary.low == summary.high)
+    if len(constant):
+        shown = ", ".join(map(str, constant[:10])) + (", ..." if len(constant) > 10 else "")
+        findings.notes.append(f"{len(constant)} observation columns are constant: {shown}")
+    if summary.largest > HUGE_VALUE:
+        findings.warnings.append(f"observations reach {summary.largest:.3g}: such values make the loss NaN, rescale them")
+
+
+def check_flags(terminals: np.ndarray, timeouts: np.ndarray | None, findings: Findings) -> None:
+    """
+    Look for flags that mean nothing: most rows terminal, or both flags on one row.
+
+    :param terminals: shape (rows,), bool
+    :param timeouts: shape (rows,), bool, None if the file has none
+    :param findings: notes and warnings
+    """
+    share = float(terminals.mean())
+    if share == 1.0:
+        findings.warnings.append("each row ends an episode; V(s') is never used")
+    elif share > 0.5:
+        findings.warnings.append(f"{share:.0%} of the rows end an episode: do the flags mean 'not done'?")
+    n_both = 0 if timeouts is None else int((terminals & timeouts).sum())
+    if n_both:
+        findings.warnings.append(f"{n_both} rows are terminal and timeout at once: the terminal wins")
+
+
+def check_order(
+    rows: np.ndarray, layout: RowLayout, terminals: np.ndarray, timeouts: np.ndarray | None, findings: Findings, where: str
+) -> np.ndarray | None:
+    """
+    Compare next observations with the observations of the next rows.
+
+    A few unmarked jumps are legal, D4RL's replay sets have them: an episode ends there. If there are many, either the
+    next observations are displaced, or the rows are no sequence at all (shuffled transitions), which training does not mind.
+
+    :param rows: row matrix
+    :param layout: its columns
+    :param terminals: shape (rows,), bool
+    :param timeouts: shape (rows,), bool, None if the file has none
+    :param findings: notes and warnings
+    :param where: file, for messages
+    :return: rows at which an unmarked episode ends, shape (rows,), None if the order of rows says nothing
+    :raises DatasetSemanticsError: if the next observations are displaced by whole rows
+    """
+    jumps = find_jumps(rows, layout)
+    inner = ~terminals if timeouts is None else ~(terminals | timeouts)
+    inner[-1] = False
+    jumps &= inner
+    n_jumps, n_inner = int(jumps.sum()), int(inner.sum())
+    if n_jumps == 0:
+        return jumps
+    share = n_jumps / n_inner
+    if share < MAX_JUMP_SHARE:
+        findings.notes.append(f"{n_jumps} unmarked jumps of the observation ({share:.2%} of rows): an episode ends there")
+        return jumps
+    shift = find_shift(rows, layout, inner)
+    if shift is not None:
+        raise DatasetSemanticsError(
+            f"{share:.0%} of the next observations are not the next row's observation; next_observations[i] is "
+            f"observations[i + {1 + shift}], a shift of {shift:+d} rows",
+            where=f"{where}, key next_observations",
+            hint="Shift the array back, or leave it out",
+            key="next_observations",
+            count=n_jumps,
+        )
+    findings.warnings.append(
+        f"{share:.0%} of the next observations are not the next row's observation: if the rows are shuffled, returns and "
+        "lengths of episodes mean nothing"
+    )
+    return jumps if timeouts is None else None
+
+
+def check_duplicates(rows: np.ndarray, findings: Findings) -> None:
+    """
+    Look for rows that occur more than once, by a 64-bit hash of each row (a weighted sum of its bits with random odd weights).
+
+    :param rows: row matrix
+    :param findings: notes and warnings
+    """
+    weights = np.random.default_rng(0).integers(0, 2**63, rows.shape[1], dtype=np.uint64) * np.uint64(2) + np.uint64(1)
+    hashes = np.empty(len(rows), dtype=np.uint64)
+    for block in row_blocks(len(rows)):
+        hashes[block] = (rows[block].view(np.uint32) * weights).sum(axis=1)
+    hashes.sort()
+    share = float((hashes[1:] == hashes[:-1]).sum()) / len(rows)
+    if share > MAX_DUPLICATES:
+        findings.warnings.append(f"{share:.0%} of the rows are duplicates of another row")
+
+
+def check_episodes(episodes: Episodes, n_dropped: int, has_timeouts: bool, limit: int | None, findings: Findings) -> None:
+    """
+    Say how episodes were found and what is unusual about them.
+
+    :param episodes: the episodes
+    :param n_dropped: rows of an open last episode that are dropped
+    :param has_timeouts: whether the file marks timeouts
+    :param limit: time limit of the environment, steps, if known
+    :param findings: notes and warnings
+    """
+    n_episodes = len(episodes.starts) - episodes.open_last
+    if not has_timeouts:
+        findings.notes.append(f"no timeouts key; episode ends: {episodes.rule}; {n_episodes} episodes")
+    if episodes.open_last:
+        findings.notes.append(f"the last episode is open: {n_dropped} rows dropped")
+    longest = int(episodes.lengths.max())
+    if limit is not None and longest > limit:
+        findings.notes.append(f"episodes of up to {longest} rows are longer than the environment's limit of {limit} steps")
+
+
+def _within_half(lowest: np.ndarray, highest: np.ndarray, low: np.ndarray, half_range: np.ndarray) -> bool:
+    middle = low + half_range
+    return bool((np.maximum(highest - middle, middle - lowest) <= half_range / 2).all())

@@ -1,0 +1,165 @@
+"""What a reader is asked to do, and what it reports about a dataset."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sb3_dce.data.hashes import file_sha256
+from sb3_dce.data.hdf5 import DEFAULT_MAX_BYTES
+from sb3_dce.errors import ConfigError, DatasetIntegrityError
+
+
+@dataclass(frozen=True)
+class ReadOptions:
+    """
+    Options of every way to read a dataset.
+
+    :param d4rl_compat: use the same rows and next observations as D4RL's ``qlearning_dataset``, slips included: next
+        observations stored in the file are ignored, rows with a timeout and the last row are dropped. The paper's tables
+        are made with it.
+    :param max_episode_steps: time limit (steps) that ends episodes in data without ``timeouts``; the default is the
+        catalogue's, except for Kitchen, whose terminals mark every end
+    :param obs_dim: expected width of an observation, default the catalogue's
+    :param act_dim: expected width of an action, default the catalogue's
+    :param action_low: smallest allowed action, a number or one per entry, default -1. Actions are kept in these units; the
+        replay buffer scales them to [-1, 1].
+    :param action_high: largest allowed action, a number or one per entry, default 1
+    :param clip_actions: move actions outside of the bounds onto them; without it they are an error if they are outside by
+        more than 1 % of half the range
+    :param drop_nonfinite: leave out transitions with NaN or infinity; without it they are an error
+    :param max_bytes: largest size of the arrays of a file, bytes
+    """
+
+    d4rl_compat: bool = False
+    max_episode_steps: int | None = None
+    obs_dim: int | None = None
+    act_dim: int | None = None
+    action_low: Any = None
+    action_high: Any = None
+    clip_actions: bool = False
+    drop_nonfinite: bool = False
+    max_bytes: int = DEFAULT_MAX_BYTES
+
+    def __post_init__(self) -> None:
+        for name in ("max_episode_steps", "obs_dim", "act_dim", "max_bytes"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ConfigError(
+                    f"must be at least 1, got {value}", where=name, hint="Leave it out for the default", key=name
+                )
+
+    def action_bounds(self, act_dim: int) -> tuple[np.ndarray, np.ndarray]:
+        """
+        Bounds of each entry of an action.
+
+        :param act_dim: number of entries
+        :return: low and high, float32, shape (act_dim,)
+        :raises ConfigError: if they do not fit the width, are not finite, or low is not below high
+        """
+        given = (-1.0 if self.action_low is None else self.action_low, 1.0 if self.action_high is None else self.action_high)
+        try:
+            low, high = (np.broadcast_to(np.asarray(bound, dtype=np.float32), (act_dim,)) for bound in given)
+        except ValueError as exc:
+            raise ConfigError(
+                f"action_low and action_high must be numbers or have {act_dim} entries", hint="Give one bound per action entry"
+            ) from exc
+        if not (np.isfinite(low) & np.isfinite(high) & (low < high)).all():
+            raise ConfigError(
+                f"action_low must lie below action_high and both must be finite, got {low.tolist()} and {high.tolist()}",
+                hint="Give the bounds of the action space",
+            )
+        return low, high
+
+
+@dataclass(frozen=True, eq=False)
+class DatasetInfo:
+    """
+    Facts about a dataset, found while it was read.
+
+    :param id: catalogue id, else the name of the file without suffix, else ``arrays``
+    :param path: file, None for arrays
+    :param file_rows: rows before any was dropped
+    :param rows: transitions that can be used
+    :param episodes: number of whole episodes
+    :param episode_returns: undiscounted return of each whole episode (reward units) before any row was dropped, float64; an
+        episode that is open at the end of the file, or that lost rows with NaN or infinity, is not among them
+    :param episode_lengths: rows of each of these episodes
+    :param n_terminals: rows at which a task truly ended
+    :param n_timeouts: rows at which a time limit ended an episode
+    :param open_last_episode: whether the file ends in the middle of an episode
+    :param dropped_rows: ``file_rows - rows``
+    :param episode_rule: how the ends of episodes were found
+    :param has_next_observations: whether next observations were stored
+    :param d4rl_compat: whether D4RL's selection of rows was asked for
+    :param reward_mean: mean over the transitions that can be used, reward units
+    :param reward_min: smallest of these rewards
+    :param reward_max: largest of these rewards
+    :param action_low: smallest action found, shape (act_dim,)
+    :param action_high: largest action found, shape (act_dim,)
+    :param notes: things worth knowing
+    :param warnings: things that deserve a look, each also issued as a ``DatasetWarning``
+    """
+
+    id: str
+    path: Path | None
+    file_rows: int
+    rows: int
+    episodes: int
+    episode_returns: np.ndarray
+    episode_lengths: np.ndarray
+    n_terminals: int
+    n_timeouts: int
+    open_last_episode: bool
+    dropped_rows: int
+    episode_rule: str
+    has_next_observations: bool
+    d4rl_compat: bool
+    reward_mean: float
+    reward_min: float
+    reward_max: float
+    action_low: np.ndarray
+    action_high: np.ndarray
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    _file_state: tuple[int, int] | None = field(default=None, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.path is not None:
+            object.__setattr__(self, "_file_state", _file_state(self.path))
+
+    @cached_property
+    def sha256(self) -> str | None:
+        """
+        Hash of the file, computed when it is first asked for (hashing 100 MB takes a noticeable time).
+
+        :return: 64 hexadecimal digits, None for arrays
+        :raises DatasetIntegrityError: if the file has changed since it was read
+        """
+        if self.path is None:
+            return None
+        if not self.path.is_file() or _file_state(self.path) != self._file_state:
+            raise DatasetIntegrityError(
+                "the file has changed since it was read", where=str(self.path), hint="Read it again", path=self.path
+            )
+        return file_sha256(self.path)
+
+    @property
+    def return_range(self) -> float:
+        """
+        Largest minus smallest return of whole episodes, by which IQL divides the rewards of the gym sets.
+
+        :return: reward units, 0.0 without a whole episode
+        """
+        returns = self.episode_returns
+        return float(returns.max() - returns.min()) if len(returns) else 0.0
+
+
+def _file_state(path: Path) -> tuple[int, int]:
+    status = os.stat(path)
+    return status.st_size, status.st_mtime_ns

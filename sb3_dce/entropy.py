@@ -1,0 +1,105 @@
+"""Entropy coefficient of the SAC-style agents: fixed, or learned with an optimizer of its own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch as th
+
+from sb3_dce.errors import ConfigError
+from sb3_dce.state import Storage
+
+ENT_COEF = "log_ent_coef"  # name of the learner in the state tree
+
+
+def parse_ent_coef(ent_coef: str | float) -> tuple[bool, float]:
+    """
+    :param ent_coef: a number, ``"auto"``, or ``"auto_0.1"``
+    :return: whether it is learned, and its (first) value
+    :raises ConfigError: for anything else
+    """
+    learned = isinstance(ent_coef, str) and ent_coef.split("_")[0] == "auto"
+    text = (ent_coef.partition("_")[2] or "1.0") if isinstance(ent_coef, str) and learned else ent_coef
+    try:
+        value = float(text)
+    except (TypeError, ValueError):
+        value = float("nan")
+    if not value >= 0.0 or (learned and value == 0.0):
+        raise ConfigError(
+            f"ent_coef must be a number >= 0, 'auto' or 'auto_<start above 0>', got {ent_coef!r}",
+            key="ent_coef",
+            hint="Use 'auto' (paper, most rows) or a fixed temperature such as 1.0.",
+        )
+    return learned, value
+
+
+class EntropyCoefficient:
+    """Mixin of agents with the parameters ``ent_coef`` and ``target_entropy``; the names are those of SB3's SAC."""
+
+    ent_coef: str | float
+    target_entropy: str | float
+    log_ent_coef: th.Tensor | None
+    ent_coef_optimizer: th.optim.Optimizer | None
+
+    def check_parameters(self) -> None:
+        """
+        :raises ConfigError: if a parameter is out of its range
+        """
+        super().check_parameters()  # type: ignore[misc]
+        parse_ent_coef(self.ent_coef)
+        if self.target_entropy != "auto":
+            try:
+                float(self.target_entropy)
+            except (TypeError, ValueError):
+                raise ConfigError(
+                    f"target_entropy must be 'auto' or a number, got {self.target_entropy!r}",
+                    key="target_entropy",
+                    hint="'auto' is minus the number of action dimensions.",
+                ) from None
+
+    def setup_extras(self) -> None:
+        """Create the temperature and its optimizer."""
+        super().setup_extras()  # type: ignore[misc]
+        learned, value = parse_ent_coef(self.ent_coef)
+        device = self.device  # type: ignore[attr-defined]
+        self.log_ent_coef = self.ent_coef_optimizer = None
+        if learned:
+            self.log_ent_coef = th.log(th.full((1,), value, device=device)).requires_grad_(True)
+            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.lr_schedule(1))  # type: ignore[attr-defined]
+        else:
+            self.ent_coef_tensor = th.tensor(value, device=device)
+
+    def ent_coef_modules(self) -> list[str]:
+        """
+        :return: names of saved state dicts
+        """
+        return ["ent_coef_optimizer"] if parse_ent_coef(self.ent_coef)[0] else []
+
+    def ent_coef_tensors(self) -> list[str]:
+        """
+        :return: names of saved tensors
+        """
+        return ["log_ent_coef"] if parse_ent_coef(self.ent_coef)[0] else ["ent_coef_tensor"]
+
+    def ent_coef_storages(self) -> dict[str, Storage]:
+        """
+        :return: the learner of a learned temperature
+        """
+        if self.log_ent_coef is None:
+            return {}
+        return {ENT_COEF: Storage([self.log_ent_coef], self.ent_coef_optimizer)}
+
+    def ent_coef_coefficients(self) -> dict[str, float]:
+        """
+        :return: coefficients of the update
+        """
+        if self.log_ent_coef is None:
+            return {"ent_coef": float(self.ent_coef_tensor)}
+        if self.target_entropy != "auto":
+            return {"target_entropy": float(self.target_entropy)}
+        return {"target_entropy": -float(np.prod(self.action_space.shape))}  # type: ignore[attr-defined]
+
+    def _excluded_save_params(self) -> list[str]:
+        names: list[Any] = super()._excluded_save_params()  # type: ignore[misc]
+        return [*names, "log_ent_coef", "ent_coef_optimizer", "ent_coef_tensor"]

@@ -1,0 +1,201 @@
+"""
+Dataset ids as Gymnasium environments.
+
+Importing this module registers every id of the catalogue: ``gym.make("halfcheetah-medium-v2")`` is the environment
+in which a policy trained on that dataset is scored (version 4 of the locomotion environments, Adroit and Kitchen with
+the corrections of :mod:`sb3_dce.robotics`). Registering imports no simulator.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.envs.registration import load_env_creator
+from gymnasium.wrappers.utils import create_zero_array
+
+from sb3_dce.data import catalog
+from sb3_dce.data.catalog import DatasetSpec
+from sb3_dce.errors import ConfigError
+from sb3_dce.robotics import KITCHEN_ROBOT_NOISE_RATIO, KitchenObservation, fix_adroit, fix_kitchen_joint_types, kitchen_tasks
+
+# the release of Gymnasium all scores were made with
+_GYMNASIUM_WITH_V4 = "1.4.0"
+_PACKAGES = {
+    "gym": ("mujoco",),
+    "adroit": ("mujoco", "gymnasium_robotics"),
+    "kitchen": ("mujoco", "gymnasium_robotics"),
+}
+INSTALL_COMMANDS = {"mujoco": "pip install mujoco", "gymnasium_robotics": 'pip install "sb3_dce[robotics]"'}
+
+
+class SpacesEnv(gym.Env):
+    """
+    An environment that has spaces and nothing else: enough to build, train, save and load an offline agent.
+
+    :param observation_space: space of the observations
+    :param action_space: space of the actions
+    """
+
+    def __init__(self, observation_space: spaces.Space, action_space: spaces.Space) -> None:
+        self.observation_space = observation_space
+        self.action_space = action_space
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """
+        :param seed: seed of ``self.np_random``
+        :param options: unused
+        :return: the observation of the space nearest to zero, and an empty dictionary
+        """
+        super().reset(seed=seed, options=options)
+        return create_zero_array(self.observation_space), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """
+        :param action: any
+        :raises RuntimeError: always
+        """
+        raise RuntimeError(
+            "This environment has spaces only and cannot be stepped. Offline training never needs it: pass an env to "
+            "evaluate, for example gym.make('halfcheetah-medium-v2') with the simulator installed."
+        )
+
+
+def register_envs() -> None:
+    """Register every dataset id of the catalogue as a Gymnasium environment; ids that are there already stay."""
+    for spec in catalog.all_specs():
+        if spec.id not in gym.registry:
+            gym.register(
+                id=spec.id,
+                entry_point="sb3_dce.envs:make_dataset_env",
+                max_episode_steps=spec.max_episode_steps,
+                disable_env_checker=True,
+                kwargs={"dataset_id": spec.id},
+            )
+
+
+def use_spaces_only(dataset_id: str) -> None:
+    """
+    Let ``gym.make(dataset_id)`` return a :class:`SpacesEnv` in this process, for training without the simulator.
+
+    :param dataset_id: id of the catalogue
+    """
+    gym.registry[dataset_id].kwargs["spaces_only"] = True
+
+
+def make_dataset_env(dataset_id: str, render_mode: str | None = None, spaces_only: bool = False, **kwargs: Any) -> gym.Env:
+    """
+    Environment of a dataset, without time limit (``gym.make(dataset_id)`` adds it).
+
+    :param dataset_id: id of the catalogue
+    :param render_mode: passed on to the simulator
+    :param spaces_only: return a :class:`SpacesEnv`, which needs no simulator
+    :param kwargs: passed on to the simulator
+    :return: the environment
+    :raises ConfigError: if the package of the simulator is missing or no longer has the environment
+    """
+    spec = catalog.resolve(dataset_id)
+    if spaces_only:
+        return SpacesEnv(*dataset_spaces(spec))
+    package = missing_package(spec)
+    if package is not None:
+        raise ConfigError(
+            f"the environment of {spec.id!r} needs the package {package!r}",
+            key=package,
+            hint=f"Install it with: {INSTALL_COMMANDS[package]}",
+        )
+    kwargs["render_mode"] = render_mode
+    if spec.family == "adroit":
+        return fix_adroit(_simulator(spec.env_id, **kwargs))
+    if spec.family == "kitchen":
+        fix_kitchen_joint_types()
+        defaults = {"tasks_to_complete": kitchen_tasks(spec.id), "robot_noise_ratio": KITCHEN_ROBOT_NOISE_RATIO}
+        return KitchenObservation(_simulator(spec.env_id, **{**defaults, **kwargs}))
+    return _simulator(spec.env_id, **kwargs)
+
+
+def make_env_if_possible(dataset_id: str) -> gym.Env:
+    """
+    Environment of a dataset with its time limit, or its spaces where the simulator is not installed.
+
+    :param dataset_id: id of the catalogue
+    :return: an environment that can be stepped, else a :class:`SpacesEnv`
+    """
+    spec = catalog.resolve(dataset_id)
+    if missing_package(spec) is not None:
+        return SpacesEnv(*dataset_spaces(spec))
+    # not gym.make(id): it would call the version 0 sets outdated because there are version 1 sets
+    env = gym.spec(spec.id).make()
+    assert isinstance(env, gym.Env)
+    return env
+
+
+def missing_package(spec: DatasetSpec) -> str | None:
+    """
+    :param spec: catalogue entry
+    :return: the package without which the environment cannot run, or ``None`` if nothing is missing
+    """
+    for package in _PACKAGES[spec.family]:
+        try:
+            # Gymnasium-Robotics announces its reward change at import; fix_adroit undoes that change
+            with contextlib.redirect_stderr(io.StringIO()):
+                importlib.import_module(package)
+        except ImportError:
+            return package
+    return None
+
+
+def dataset_spaces(spec: DatasetSpec) -> tuple[spaces.Box, spaces.Box]:
+    """
+    The spaces of the environment of a dataset, known without its simulator.
+
+    :param spec: catalogue entry
+    :return: observation space (unbounded, float64) and action space ([-1, 1], float32)
+    """
+    return (
+        spaces.Box(-np.inf, np.inf, (spec.obs_dim,), np.float64),
+        spaces.Box(-1.0, 1.0, (spec.act_dim,), np.float32),
+    )
+
+
+def _simulator(env_id: str, **kwargs: Any) -> gym.Env:
+    """The registered environment itself: no wrappers, and none of ``gym.make``'s advice to use another version."""
+    try:
+        spec = gym.spec(env_id)
+    except gym.error.Error as error:
+        raise ConfigError(
+            f"Gymnasium {gym.__version__} has no environment {env_id!r} ({error})",
+            hint=f'Install a release that has it, for example: pip install "gymnasium=={_GYMNASIUM_WITH_V4}"',
+        ) from error
+    assert spec.entry_point is not None
+    creator = spec.entry_point if callable(spec.entry_point) else load_env_creator(spec.entry_point)
+    with _quiet_model_compiler():
+        env = creator(**{**spec.kwargs, **kwargs})
+    assert isinstance(env, gym.Env)
+    return env
+
+
+@contextlib.contextmanager
+def _quiet_model_compiler() -> Iterator[None]:
+    """
+    Keep MuJoCo from warning about the models that Gymnasium ships.
+
+    MuJoCo prints such a warning and appends it to ``MUJOCO_LOG.TXT`` in the working directory unless a handler is set.
+    """
+    import mujoco
+
+    handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(handler)
+
+
+register_envs()

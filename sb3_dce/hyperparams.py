@@ -1,0 +1,143 @@
+"""
+Rows of the YAML files in ``zoo_hyperparams/``, read as rl_zoo3 reads them but without evaluating strings.
+
+One file per algorithm (``dce.yml``), one row per dataset id. A row holds constructor parameters and keys of the zoo.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+from collections.abc import Iterable
+from importlib import resources
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import yaml
+
+from sb3_dce.data import catalog
+from sb3_dce.errors import ConfigError
+
+if TYPE_CHECKING:
+    from importlib.resources.abc import Traversable
+
+# keys that rl_zoo3 removes before it calls the constructor
+ZOO_KEYS = frozenset(
+    {
+        "callback",
+        "env_kwargs",
+        "env_wrapper",
+        "frame_stack",
+        "monitor_kwargs",
+        "n_envs",
+        "n_timesteps",
+        "noise_std",
+        "noise_type",
+        "normalize",
+        "vec_env_wrapper",
+    }
+)
+
+
+class SplitRow(NamedTuple):
+    """
+    A row, sorted by who uses what.
+
+    :param kwargs: constructor keywords
+    :param n_timesteps: gradient steps of a full run
+    :param zoo: keys only rl_zoo3 understands, without ``n_timesteps``
+    """
+
+    kwargs: dict[str, Any]
+    n_timesteps: int
+    zoo: dict[str, Any]
+
+
+def file_of(algo: str) -> Traversable:
+    """
+    :param algo: name of an algorithm, e.g. ``dce``
+    :return: its file inside the installed package
+    :raises ConfigError: if there is none
+    """
+    folder = resources.files("sb3_dce.zoo_hyperparams")
+    known = sorted(entry.name.removesuffix(".yml") for entry in folder.iterdir() if entry.name.endswith(".yml"))
+    if algo not in known:
+        raise ConfigError(
+            f"no hyperparameters for algorithm {algo!r}",
+            key="algo",
+            hint=f"{did_you_mean(algo, known)}Known: {', '.join(known)}.",
+        )
+    return folder / f"{algo}.yml"
+
+
+def read_rows(algo: str) -> dict[str, dict[str, Any]]:
+    """
+    :param algo: name of an algorithm, e.g. ``dce``
+    :return: rows by dataset id, and ``default``; the anchors (``<family>-defaults``) are left out
+    """
+    rows = yaml.safe_load(file_of(algo).read_text(encoding="utf-8"))
+    return {name: row for name, row in rows.items() if not name.endswith("-defaults")}
+
+
+def load_row(algo: str, dataset_id: str) -> dict[str, Any]:
+    """
+    Hyperparameters of an algorithm on a dataset.
+
+    A dataset without a row of its own uses that of the paper's dataset it stands for, else ``default``.
+
+    :param algo: name of an algorithm, e.g. ``dce``
+    :param dataset_id: id or alias of the catalogue
+    :return: a row of the caller's own, with ``dataset`` set to the full id
+    :raises ConfigError: if the algorithm is unknown or its file has no row that applies
+    :raises DatasetError: if the dataset is unknown
+    """
+    spec = catalog.resolve(dataset_id)
+    rows = read_rows(algo)
+    names = (spec.id, spec.paper_row, "default")
+    for name in names:
+        if name in rows:
+            return {**rows[name], "dataset": spec.id}
+    raise ConfigError(f"no row of the name {' or '.join(names)}", where=str(file_of(algo)), hint="Add one.")
+
+
+def split_row(row: dict[str, Any]) -> SplitRow:
+    """
+    :param row: a row as read from the file
+    :return: constructor keywords, number of gradient steps, keys of the zoo
+    :raises ConfigError: if the row does not say how long to train
+    """
+    if "n_timesteps" not in row:
+        raise ConfigError("the row has no n_timesteps", key="n_timesteps", hint="Add it, for example 1000000.")
+    kwargs = {key: value for key, value in row.items() if key not in ZOO_KEYS}
+    zoo = {key: value for key, value in row.items() if key in ZOO_KEYS and key != "n_timesteps"}
+    return SplitRow(kwargs, int(row["n_timesteps"]), zoo)
+
+
+def check_keys(cls: type, keys: Iterable[str], where: str = "hyperparameters") -> None:
+    """
+    Refuse a key that neither the constructor nor the zoo knows; otherwise it surfaces as a ``TypeError`` much later.
+
+    :param cls: class the row is for
+    :param keys: the row, or its keys
+    :param where: file or argument the keys come from, for the message
+    :raises ConfigError: naming the key, the closest parameter and the file
+    """
+    parameters = [name for name in inspect.signature(cls).parameters if not name.startswith("_")]
+    allowed = {*parameters, *ZOO_KEYS}
+    for key in keys:
+        if key not in allowed:
+            raise ConfigError(
+                f"{cls.__name__} has no parameter {key!r}",
+                where=where,
+                key=key,
+                hint=did_you_mean(key, allowed).strip() or f"Its parameters: {', '.join(parameters)}.",
+            )
+
+
+def did_you_mean(name: str, candidates: Iterable[str]) -> str:
+    """
+    :param name: what the user wrote
+    :param candidates: what is allowed
+    :return: "Did you mean '...'? " with the closest candidate, or an empty string
+    """
+    close = difflib.get_close_matches(name, list(candidates), n=1)
+    return f"Did you mean {close[0]!r}? " if close else ""

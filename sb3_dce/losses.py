@@ -1,0 +1,188 @@
+"""
+Losses of the paper and the blocks they are made of: pure tensor functions, torch only.
+
+Tensors are ``(..., batch, 1)``; a loss averages over the last two dimensions, so that any leading (model) dimensions
+survive and a single model gives a 0-dimensional tensor. Equation numbers are those of the DCE paper (Zhao, Huang, Yuan:
+"DCE: Offline Reinforcement Learning With Double Conservative Estimates").
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch as th
+from torch.nn import functional as F
+
+# The same small constant as in Stable-Baselines3's SquashedDiagGaussianDistribution, so that log-probabilities agree.
+SQUASH_EPSILON = 1e-6
+
+
+def batch_mean(values: th.Tensor) -> th.Tensor:
+    """
+    Mean over batch and last dimension.
+
+    :param values: shape (..., batch, 1)
+    :return: shape (...)
+    """
+    return values.mean(dim=(-2, -1))
+
+
+def expectile_loss(diff: th.Tensor, expectile: float | th.Tensor) -> th.Tensor:
+    """
+    Asymmetric square ``mean(|expectile - 1(diff < 0)| * diff^2)`` (Eq. 4); at 0.5 it is half the mean square.
+
+    The weight is computed in the dtype of ``diff``: ``torch.where`` with Python numbers would be float32 even in float64.
+
+    :param diff: target minus prediction, shape (..., batch, 1), reward units
+    :param expectile: level in (0, 1); the paper's tau. Above 0.5 the prediction leans to the larger targets
+    :return: shape (...)
+    """
+    return batch_mean(th.abs(expectile - (diff < 0).to(diff.dtype)) * diff.square())
+
+
+def value_loss(target_q_values: th.Tensor, values: th.Tensor, expectile: float | th.Tensor) -> th.Tensor:
+    """
+    Expectile regression of V on the target critics (Eq. 4).
+
+    :param target_q_values: reduced over the target critics, without gradient, shape (..., batch, 1)
+    :param values: V(s), shape (..., batch, 1)
+    :param expectile: level in (0, 1)
+    :return: shape (...)
+    """
+    return expectile_loss(target_q_values - values, expectile)
+
+
+def td_target(
+    rewards: th.Tensor, dones: th.Tensor, next_values: th.Tensor, gamma: float | th.Tensor
+) -> th.Tensor:
+    """
+    One-step target ``r + gamma * (1 - d) * V(s')`` (right-hand side of Eq. 5).
+
+    :param rewards: shape (..., batch, 1), reward units
+    :param dones: shape (..., batch, 1), 1 only at true terminals; a time limit is 0
+    :param next_values: shape (..., batch, 1), reward units
+    :param gamma: discount factor in [0, 1]
+    :return: shape (..., batch, 1), reward units
+    """
+    return rewards + gamma * (1.0 - dones) * next_values
+
+
+def critic_loss(
+    q_values: Sequence[th.Tensor], target_q_values: th.Tensor, td_loss_coef: float | th.Tensor
+) -> th.Tensor:
+    """
+    Temporal-difference mean square, summed over the critics (first term of Eq. 6).
+
+    :param q_values: Q_i(s, a) of each critic, each of shape (..., batch, 1)
+    :param target_q_values: common target without gradient, shape (..., batch, 1)
+    :param td_loss_coef: factor before the mean square; 1 is Eq. 6 as printed, 0.5 gives the paper's theory units
+    :return: shape (...)
+    """
+    return td_loss_coef * sum_over_critics([batch_mean((target_q_values - q).square()) for q in q_values])
+
+
+def policy_penalty(q_values: Sequence[th.Tensor], beta: float | th.Tensor) -> th.Tensor:
+    """
+    Linear penalty ``beta * E[Q_i(s, a')]`` with a' from the current policy, summed over the critics (second term of Eq. 6).
+
+    It shifts Q on the data by exactly ``-beta / (2 * td_loss_coef)`` per Bellman step and actions away from the data at
+    least as much.
+
+    :param q_values: Q_i(s, a') of each critic, shape (..., batch, 1), or (..., n_actions * batch, 1)
+    :param beta: weight of the penalty, reward units
+    :return: shape (...)
+    """
+    return beta * sum_over_critics([batch_mean(q) for q in q_values])
+
+
+def sum_over_critics(values: Sequence[th.Tensor]) -> th.Tensor:
+    """
+    :param values: one tensor per critic, equal shapes
+    :return: their sum
+    """
+    total = values[0]
+    for value in values[1:]:
+        total = total + value
+    return total
+
+
+def reduce_critics(q_values: Sequence[th.Tensor], how: str) -> th.Tensor:
+    """
+    One value from several critics.
+
+    :param q_values: one tensor per critic, equal shapes (..., batch, 1)
+    :param how: "min", "mean" or "first"
+    :return: shape (..., batch, 1)
+    """
+    if how == "first":
+        return q_values[0]
+    if how == "mean":
+        return sum_over_critics(q_values) / len(q_values)
+    smallest = q_values[0]
+    for q in q_values[1:]:
+        smallest = th.minimum(smallest, q)
+    return smallest
+
+
+def sac_actor_loss(log_prob: th.Tensor, q_values_pi: th.Tensor, ent_coef: th.Tensor) -> th.Tensor:
+    """
+    ``mean(alpha * log pi(a|s) - Q(s, a))`` with a reparameterised a ~ pi (Eq. 11).
+
+    :param log_prob: shape (..., batch, 1), nats
+    :param q_values_pi: reduced over the critics, shape (..., batch, 1)
+    :param ent_coef: temperature (the paper's alpha), without gradient, shape (...) or (1,)
+    :return: shape (...)
+    """
+    return batch_mean(ent_coef * log_prob - q_values_pi)
+
+
+def ent_coef_loss(log_ent_coef: th.Tensor, log_prob: th.Tensor, target_entropy: float | th.Tensor) -> th.Tensor:
+    """
+    Dual loss of the temperature, ``-mean(log alpha * (log pi + target entropy))``, as in Stable-Baselines3's SAC.
+
+    :param log_ent_coef: shape (1,)
+    :param log_prob: without gradient, shape (..., batch, 1), nats
+    :param target_entropy: wished entropy, nats; usually minus the number of action dimensions
+    :return: shape (...)
+    """
+    return -batch_mean(log_ent_coef * (log_prob + target_entropy))
+
+
+def squashed_gaussian(mean: th.Tensor, log_std: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """
+    Reparameterised draw ``tanh(mean + exp(log_std) * noise)`` and its log-probability.
+
+    The same formula as Stable-Baselines3's ``SquashedDiagGaussianDistribution``, with the randomness as an argument.
+
+    :param mean: shape (..., batch, action_dim)
+    :param log_std: shape (..., batch, action_dim)
+    :param noise: standard normal, shape (..., batch, action_dim)
+    :return: actions in [-1, 1], shape (..., batch, action_dim), and log-probabilities (nats), shape (..., batch, 1)
+    """
+    actions = th.tanh(mean + log_std.exp() * noise)
+    log_gaussian = -0.5 * noise.square() - log_std - 0.5 * math.log(2.0 * math.pi)
+    log_squash = th.log(1.0 - actions.square() + SQUASH_EPSILON)
+    return actions, (log_gaussian - log_squash).sum(dim=-1, keepdim=True)
+
+
+def floored(q_values: th.Tensor, floor: float) -> th.Tensor:
+    """
+    Values at or below ``floor`` replaced by ``floor``: nothing pushes them further down.
+
+    :param q_values: any shape, reward units
+    :param floor: reward units
+    :return: same shape
+    """
+    return th.clamp(q_values, min=floor)
+
+
+def hinge(q_values: th.Tensor, values: th.Tensor) -> th.Tensor:
+    """
+    ``relu(Q(s, a') - V(s))``: actions already below the value of the state are left alone (paper, section 4.2).
+
+    :param q_values: shape (..., batch, 1), reward units
+    :param values: V(s) without gradient, shape (..., batch, 1), reward units
+    :return: shape (..., batch, 1)
+    """
+    return F.relu(q_values - values)

@@ -1,0 +1,98 @@
+"""
+Adam and AdamW as pure functions of tensors, with the arithmetic of ``torch.optim``.
+
+A learner is one flat parameter vector with its moments. The step count and the learning rate are tensors, so that a
+compiled or captured step never bakes in a number that changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch as th
+
+from sb3_dce.errors import ConfigError
+
+
+class Learner(NamedTuple):
+    """Parameters of one optimizer step; all vectors have shape (..., n_parameters), ``step`` has shape (...)."""
+
+    params: th.Tensor
+    exp_avg: th.Tensor
+    exp_avg_sq: th.Tensor
+    step: th.Tensor
+
+
+@dataclass(frozen=True)
+class AdamSettings:
+    """
+    Constants of one optimizer.
+
+    :param beta1: decay of the first moment
+    :param beta2: decay of the second moment
+    :param eps: added to the root of the second moment
+    :param weight_decay: L2 coefficient
+    :param decoupled: True for AdamW (decay of the parameters), False for Adam (decay added to the gradient)
+    """
+
+    beta1: float = 0.9
+    beta2: float = 0.999
+    eps: float = 1e-8
+    weight_decay: float = 0.0
+    decoupled: bool = False
+
+    @classmethod
+    def of(cls, optimizer: th.optim.Optimizer) -> AdamSettings:
+        """
+        Read the constants of a torch optimizer.
+
+        :param optimizer: ``torch.optim.Adam`` or ``torch.optim.AdamW`` with one parameter group
+        :return: its constants
+        :raises ConfigError: for any other optimizer, or for options this package does not implement
+        """
+        if type(optimizer) not in (th.optim.Adam, th.optim.AdamW):
+            raise ConfigError(
+                f"optimizer_class must be torch.optim.Adam or torch.optim.AdamW, got {type(optimizer).__name__}",
+                key="optimizer_class",
+                hint='Choose one of the two in policy_kwargs={"optimizer_class": ...}.',
+            )
+        group = optimizer.param_groups[0]
+        for option in ("amsgrad", "maximize"):
+            if group.get(option):
+                raise ConfigError(
+                    f"optimizer option {option}=True is not supported", key=option, hint="Remove it from optimizer_kwargs."
+                )
+        return cls(
+            beta1=group["betas"][0],
+            beta2=group["betas"][1],
+            eps=group["eps"],
+            weight_decay=group["weight_decay"],
+            decoupled=isinstance(optimizer, th.optim.AdamW),
+        )
+
+
+def adam_step(learner: Learner, gradient: th.Tensor, learning_rate: th.Tensor, settings: AdamSettings) -> Learner:
+    """
+    One step of Adam (Kingma & Ba, 2015) or AdamW (Loshchilov & Hutter, 2019).
+
+    :param learner: state before the step
+    :param gradient: shape (..., n_parameters)
+    :param learning_rate: 0-dimensional tensor
+    :param settings: constants
+    :return: state after the step; nothing is changed in place
+    """
+    params = learner.params
+    if settings.weight_decay and settings.decoupled:
+        params = params * (1.0 - learning_rate * settings.weight_decay)
+    elif settings.weight_decay:
+        gradient = gradient + settings.weight_decay * params
+    step = learner.step + 1.0
+    exp_avg = th.lerp(learner.exp_avg, gradient, 1.0 - settings.beta1)
+    exp_avg_sq = settings.beta2 * learner.exp_avg_sq + (1.0 - settings.beta2) * gradient.square()
+    # In float64 whatever the parameters' dtype: 1 - beta2^step loses half its digits in float32 at the start.
+    exact_step = step.double()
+    step_size = (learning_rate / (1.0 - settings.beta1**exact_step)).to(params.dtype)
+    root_correction = (1.0 - settings.beta2**exact_step).sqrt().to(params.dtype)
+    params = params - step_size * exp_avg / (exp_avg_sq.sqrt() / root_correction + settings.eps)
+    return Learner(params, exp_avg, exp_avg_sq, step)

@@ -1,0 +1,150 @@
+"""Policies of the offline agents: Stable-Baselines3's SAC policy with a state-value network beside the critics."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, get_actor_critic_arch
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.sac.policies import Actor, SACPolicy
+from torch import nn
+
+from sb3_dce.errors import ConfigError
+from sb3_dce.networks import OfflineActor, OfflineCritic, ValueNet
+
+
+class OfflineSACPolicy(SACPolicy):
+    """
+    Squashed-Gaussian actor, critics with targets and, if wished, a state-value network.
+
+    :param observation_space: observation space
+    :param action_space: action space
+    :param lr_schedule: learning rate as a function of the remaining progress
+    :param net_arch: widths of the hidden layers, default [256, 256]; ``dict(pi=[...], qf=[...])`` to tell them apart
+    :param activation_fn: activation of the hidden layers
+    :param features_extractor_class: network applied to the observations first; each network has its own copy
+    :param features_extractor_kwargs: its keyword arguments
+    :param normalize_images: divide image observations by 255
+    :param optimizer_class: ``torch.optim.Adam`` or ``torch.optim.AdamW``
+    :param optimizer_kwargs: its keyword arguments, learning rate excluded
+    :param n_critics: number of critics
+    :param share_features_extractor: must be False
+    :param use_v: build the state-value network
+    :param use_target_v: build a moving-average copy of it
+    :param critic_layer_norm: put a ``LayerNorm`` before each hidden activation of the critics
+    :param critic_weight_decay: L2 coefficient of the critics' optimizer
+    """
+
+    value_net: ValueNet | None
+    value_net_target: ValueNet | None
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        features_extractor_class: type[BaseFeaturesExtractor] = FlattenExtractor,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        n_critics: int = 2,
+        share_features_extractor: bool = False,
+        use_v: bool = False,
+        use_target_v: bool = False,
+        critic_layer_norm: bool = False,
+        critic_weight_decay: float = 0.0,
+    ) -> None:
+        if share_features_extractor:
+            raise ConfigError(
+                "share_features_extractor=True is not supported: actor, critics and V are trained by losses of their own",
+                key="share_features_extractor",
+                hint="Leave it out of policy_kwargs.",
+            )
+        self.use_v = use_v
+        self.use_target_v = use_target_v
+        self.critic_layer_norm = critic_layer_norm
+        self.critic_weight_decay = critic_weight_decay
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            net_arch=net_arch,
+            activation_fn=activation_fn,
+            features_extractor_class=features_extractor_class,
+            features_extractor_kwargs=features_extractor_kwargs,
+            normalize_images=normalize_images,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            n_critics=n_critics,
+        )
+        _refuse_batch_norm(self)
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        if self.critic_weight_decay:
+            self.critic.optimizer.param_groups[0]["weight_decay"] = self.critic_weight_decay
+        self.value_net = self.value_net_target = None
+        if not self.use_v:
+            return
+        self.value_net = self.make_value_net()
+        self.value_net.optimizer = self.optimizer_class(
+            self.value_net.parameters(),
+            lr=lr_schedule(1),  # type: ignore[call-arg]
+            **self.optimizer_kwargs,
+        )
+        if self.use_target_v:
+            self.value_net_target = self.make_value_net()
+            self.value_net_target.load_state_dict(self.value_net.state_dict())
+            self.value_net_target.set_training_mode(False)
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
+        return OfflineActor(**self._update_features_extractor(self.actor_kwargs, features_extractor)).to(self.device)
+
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
+        kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
+        return OfflineCritic(**kwargs, layer_norm=self.critic_layer_norm).to(self.device)
+
+    def make_value_net(self) -> ValueNet:
+        """
+        :return: a new state-value network with the critics' hidden layers
+        """
+        kwargs = self._update_features_extractor(self.net_args, None)
+        _, critic_arch = get_actor_critic_arch(self.net_arch)
+        kwargs["net_arch"] = critic_arch
+        return ValueNet(**kwargs).to(self.device)
+
+    def set_training_mode(self, mode: bool) -> None:
+        """
+        :param mode: True for training, False for evaluation; the targets always stay in evaluation mode
+        """
+        super().set_training_mode(mode)
+        if self.value_net is not None:
+            self.value_net.set_training_mode(mode)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        for name in ("use_sde", "log_std_init", "use_expln", "clip_mean"):  # gSDE is not offered
+            del data[name]
+        data.update(
+            use_v=self.use_v,
+            use_target_v=self.use_target_v,
+            critic_layer_norm=self.critic_layer_norm,
+            critic_weight_decay=self.critic_weight_decay,
+        )
+        return data
+
+
+def _refuse_batch_norm(policy: nn.Module) -> None:
+    for module in policy.modules():
+        if isinstance(module, nn.modules.batchnorm._BatchNorm):
+            raise ConfigError(
+                f"{type(module).__name__} is not supported: its running statistics change inside a pure update",
+                key="features_extractor_class",
+                hint="Use LayerNorm, or normalize_obs=True for dataset statistics.",
+            )

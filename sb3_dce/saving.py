@@ -1,0 +1,139 @@
+"""Saving and loading of offline agents: an ordinary Stable-Baselines3 zip, never with the dataset in it."""
+
+from __future__ import annotations
+
+import io
+import pathlib
+from collections.abc import Iterable
+from typing import Any, TypeVar
+
+import torch as th
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.save_util import recursive_getattr
+from stable_baselines3.common.type_aliases import GymEnv, TensorDict
+
+from sb3_dce import hyperparams
+from sb3_dce.errors import CheckpointError, DivergenceError
+from sb3_dce.files import write_atomically
+
+SelfSaving = TypeVar("SelfSaving", bound="SavingMixin")
+
+# Not in the zip: what is large, what can be made again, and what SB3 would pickle although nothing needs it.
+EXCLUDED = (
+    *("_transitions", "_engine", "_generator", "_coef", "_metrics_read_at"),
+    *("_last_obs", "_last_episode_starts", "_last_original_obs", "ep_info_buffer", "ep_success_buffer"),
+)
+
+
+class SavingMixin(OffPolicyAlgorithm):
+    """What :class:`~sb3_dce.base.OfflineAlgorithm` changes about saving and loading."""
+
+    _generator: th.Generator | None
+    rng_state: th.Tensor
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), *EXCLUDED]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy"], ["rng_state"]
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        Save the model as a Stable-Baselines3 zip file, without the dataset.
+
+        A file that is already there is only replaced by a complete new one.
+
+        :param path: file name (".zip" is appended if it has no suffix) or binary file object
+        :param exclude: attributes left out
+        :param include: attributes saved although they are excluded by default
+        :raises DivergenceError: if a parameter is not finite
+        :raises CheckpointError: if the file cannot be written
+        """
+        for name, parameter in self.policy.named_parameters():
+            if not bool(th.isfinite(parameter).all()):
+                raise DivergenceError(
+                    f"refusing to save: {name} is not finite",
+                    key=name,
+                    hint="Go back to an earlier checkpoint; lower learning_rate or beta.",
+                )
+        if self._generator is not None:
+            self.rng_state = self._generator.get_state()
+        if isinstance(path, io.IOBase):
+            super().save(path, exclude, include)
+            return
+        target = pathlib.Path(path)  # type: ignore[arg-type]
+        target = target if target.suffix else target.with_suffix(".zip")
+        with write_atomically(target) as stream:
+            super().save(stream, exclude, include)  # type: ignore[arg-type]
+
+    @classmethod
+    def load(  # type: ignore[override]
+        cls: type[SelfSaving],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> SelfSaving:
+        """
+        Load a model. No dataset is read and no replay buffer allocated; ``learn()`` attaches the data again.
+
+        :param path: zip file
+        :param env: environment for evaluation; may be ``None``
+        :param device: device of the networks
+        :param custom_objects: replacements of saved attributes
+        :param print_system_info: print versions of this machine and of the file
+        :param force_reset: kept for Stable-Baselines3
+        :param kwargs: constructor arguments that replace the saved ones
+        :return: model
+        :raises ConfigError: for an unknown keyword
+        :raises CheckpointError: if the parameters in the file do not fit the (changed) configuration
+        """
+        hyperparams.check_keys(cls, kwargs, where=f"{cls.__name__}.load")
+        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+
+    def set_parameters(
+        self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        """
+        Load parameters of networks and optimizers; see Stable-Baselines3.
+
+        :param load_path_or_dict: zip file, or dictionary as from ``get_parameters()``
+        :param exact_match: demand all parameters
+        :param device: device
+        :raises CheckpointError: if the parameters belong to another configuration
+        """
+        if isinstance(load_path_or_dict, dict) and exact_match:
+            expected, got = set(self._get_torch_save_params()[0]), set(load_path_or_dict)
+            if expected != got:
+                # Not a ValueError: SB3's load() would take one for an old DQN file and end in a bare KeyError.
+                raise CheckpointError(
+                    f"parameters do not match this configuration: missing {sorted(expected - got)}, "
+                    f"unknown {sorted(got - expected)}",
+                    hint="ent_coef cannot change between 'auto' and a number, nor use_v, when a saved model is loaded.",
+                )
+        super().set_parameters(load_path_or_dict, exact_match, device)
+
+    def get_parameters(self) -> dict[str, dict]:
+        """
+        :return: state dicts by name; the tensors are copies, independent of further training
+        """
+        return {name: _cloned(recursive_getattr(self, name).state_dict()) for name in self._get_torch_save_params()[0]}
+
+
+def _cloned(tree: Any) -> Any:
+    # A view of the flat storage would drag the whole storage into a file, and change with the next update.
+    if isinstance(tree, th.Tensor):
+        return tree.detach().clone()
+    if isinstance(tree, dict):
+        return type(tree)((key, _cloned(value)) for key, value in tree.items())
+    if isinstance(tree, list):
+        return [_cloned(value) for value in tree]
+    return tree

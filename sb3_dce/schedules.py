@@ -1,0 +1,52 @@
+"""Schedules as small picklable classes: values are computed from the number of updates, never accumulated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sb3_dce.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class StepSchedule:
+    """
+    Stepwise linear schedule of the paper: after every ``every`` updates the value moves by ``-rate`` until ``final``.
+
+    :param initial: value before the first change
+    :param final: value it never passes; ``None`` means constant and needs ``rate == 0``
+    :param rate: amount subtracted at each change; negative for a rising value
+    :param every: updates between two changes (the paper: 50 epochs of 1000 updates = 50,000)
+    :raises ConfigError: if ``rate`` points away from ``final``, is given without one, or ``every`` is below 1
+    """
+
+    initial: float
+    final: float | None = None
+    rate: float = 0.0
+    every: int = 50_000
+
+    def __post_init__(self) -> None:
+        if self.every < 1:
+            raise ConfigError(f"every must be at least 1 update, got {self.every}", key="every", hint="Use 50000 (paper).")
+        if self.final is None:
+            if self.rate != 0:
+                raise ConfigError(
+                    f"beta_rate={self.rate} needs an end value, got beta_final=None",
+                    key="beta_final",
+                    hint="Give beta_final, or set beta_rate=0 for a constant beta.",
+                )
+        elif (self.initial - self.final) * self.rate < 0:
+            raise ConfigError(
+                f"beta_rate={self.rate} moves beta={self.initial} away from beta_final={self.final}",
+                key="beta_rate",
+                hint="beta falls by beta_rate at each change: use a positive rate to fall and a negative one to rise.",
+            )
+
+    def value(self, n_updates: int) -> float:
+        """
+        :param n_updates: completed updates before the step
+        :return: value in force during the next update
+        """
+        if self.final is None:
+            return self.initial
+        moved = self.initial - (n_updates // self.every) * self.rate
+        return max(moved, self.final) if self.final <= self.initial else min(moved, self.final)

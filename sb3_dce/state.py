@@ -1,0 +1,173 @@
+"""
+Bridge between Stable-Baselines3's modules and the pure update.
+
+The parameters of a network lie in one flat vector of which the module's own tensors are views, and so do the moments of
+its optimizer. The update reads and writes the vectors; ``state_dict()``, ``predict`` and ``save`` see the modules.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.utils import update_learning_rate
+from torch import nn
+from torch.func import functional_call
+
+from sb3_dce.optimizers import AdamSettings, Learner
+
+
+class _Method(nn.Module):
+    """A module whose ``forward`` is a chosen method of another one (``functional_call`` only calls ``forward``)."""
+
+    def __init__(self, module: nn.Module, method: str) -> None:
+        super().__init__()
+        self.module = module
+        self.method = method
+
+    def forward(self, *args: Any) -> Any:
+        return getattr(self.module, self.method)(*args)
+
+
+class PureNet:
+    """
+    A network as a function of its flat parameter vector.
+
+    :param module: Stable-Baselines3 module
+    :param method: method that is called
+    """
+
+    def __init__(self, module: nn.Module, method: str = "forward") -> None:
+        self._wrapper = _Method(module, method)
+        named = dict(self._wrapper.named_parameters())
+        self._names = list(named)
+        self._shapes = [parameter.shape for parameter in named.values()]
+        self._sizes = [parameter.numel() for parameter in named.values()]
+
+    def __call__(self, flat: th.Tensor, *args: Any) -> Any:
+        """
+        :param flat: shape (n_parameters,)
+        :param args: inputs of the network
+        :return: its outputs
+        """
+        # One split, not one slice per tensor: the gradient of the split is a single concatenation.
+        pieces = flat.split(self._sizes)
+        parameters = {n: p.view(s) for n, p, s in zip(self._names, pieces, self._shapes, strict=True)}
+        return functional_call(self._wrapper, parameters, args)
+
+
+class Storage:
+    """
+    Flat storage of some parameters and of their optimizer, aliased by the originals.
+
+    :param parameters: parameters in the order of the flat vector
+    :param optimizer: their optimizer; ``None`` for target networks, which have no moments
+    """
+
+    def __init__(self, parameters: list[th.Tensor], optimizer: th.optim.Optimizer | None = None) -> None:
+        self._parameters = parameters
+        self._optimizer = optimizer
+        self.settings = None if optimizer is None else AdamSettings.of(optimizer)
+        self._bind()
+
+    def _bind(self) -> None:
+        self.params = _flatten([p.detach() for p in self._parameters])
+        for parameter, view in self._views(self.params):
+            parameter.data = view
+        if self._optimizer is None:
+            return
+        saved = [self._optimizer.state.get(p, {}) for p in self._parameters]
+        zeros = [th.zeros_like(p) for p in self._parameters]
+        self.exp_avg = _flatten([s.get("exp_avg", z) for s, z in zip(saved, zeros, strict=True)])
+        self.exp_avg_sq = _flatten([s.get("exp_avg_sq", z) for s, z in zip(saved, zeros, strict=True)])
+        steps = {float(s.get("step", 0.0)) for s in saved}
+        self.step = th.tensor(max(steps), dtype=th.float32, device=self.params.device)
+        for (parameter, first), (_, second) in zip(self._views(self.exp_avg), self._views(self.exp_avg_sq), strict=True):
+            self._optimizer.state[parameter] = {"step": self.step, "exp_avg": first, "exp_avg_sq": second}
+
+    def _views(self, flat: th.Tensor) -> list[tuple[th.Tensor, th.Tensor]]:
+        pieces = flat.split([p.numel() for p in self._parameters])
+        return [(p, piece.view(p.shape)) for p, piece in zip(self._parameters, pieces, strict=True)]
+
+    def is_bound(self) -> bool:
+        """
+        :return: whether the parameters and moments are still views of this storage; ``load_state_dict`` of an optimizer,
+            ``module.to(...)`` and Stable-Baselines3's ``load`` put other tensors in their place
+        """
+        if any(p.data_ptr() != view.data_ptr() or p.dtype != view.dtype for p, view in self._views(self.params)):
+            return False
+        if self._optimizer is None:
+            return True
+        state = self._optimizer.state
+        return all(
+            p in state and state[p]["exp_avg"].data_ptr() == view.data_ptr() and state[p]["step"] is self.step
+            for p, view in self._views(self.exp_avg)
+        )
+
+    def set_learning_rate(self, learning_rate: float) -> None:
+        """
+        :param learning_rate: value kept in the optimizer, as Stable-Baselines3 does; the update gets it as a tensor
+        """
+        if self._optimizer is not None:
+            update_learning_rate(self._optimizer, learning_rate)
+
+    def read(self) -> Learner | th.Tensor:
+        """
+        :return: a learner, or the bare flat vector of a target network
+        """
+        if self._optimizer is None:
+            return self.params
+        return Learner(self.params, self.exp_avg, self.exp_avg_sq, self.step)
+
+    def write(self, new: Learner | th.Tensor) -> None:
+        """
+        Copy new values into the storage, and so into the modules.
+
+        :param new: as returned by :meth:`read`
+        """
+        if isinstance(new, Learner):
+            self.exp_avg.copy_(new.exp_avg)
+            self.exp_avg_sq.copy_(new.exp_avg_sq)
+            self.step.copy_(new.step)
+            new = new.params
+        self.params.copy_(new)
+
+
+def _flatten(tensors: list[th.Tensor]) -> th.Tensor:
+    return th.cat([t.reshape(-1) for t in tensors]).clone()
+
+
+class TrainState:
+    """
+    State tree of one model: a name for each network's storage.
+
+    :param storages: learners and targets by name
+    """
+
+    def __init__(self, storages: dict[str, Storage]) -> None:
+        self.storages = storages
+
+    def is_bound(self) -> bool:
+        """
+        :return: whether every storage is still the one behind the modules
+        """
+        return all(storage.is_bound() for storage in self.storages.values())
+
+    def read(self) -> dict[str, Any]:
+        """
+        :return: name -> learner or flat vector
+        """
+        return {name: storage.read() for name, storage in self.storages.items()}
+
+    def write(self, new: dict[str, Any]) -> None:
+        """
+        :param new: as returned by :meth:`read`; names left out stay as they are
+        """
+        for name, value in new.items():
+            self.storages[name].write(value)
+
+    def settings(self) -> dict[str, AdamSettings]:
+        """
+        :return: optimizer constants of each learner
+        """
+        return {name: s.settings for name, s in self.storages.items() if s.settings is not None}

@@ -1,0 +1,76 @@
+"""Names of the algorithms in rl_zoo3, and the spaces in which its hyperparameter search looks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_dce.dce import OfflineDCE
+
+if TYPE_CHECKING:
+    import optuna
+
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
+    "dce": OfflineDCE,
+}
+
+
+def sample_dce_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    Draw hyperparameters of DCE; the penalty weight is searched as a constant.
+
+    A trial is judged by evaluation in the simulator, so that what is found is tuned *online*: say so with results.
+
+    :param trial: trial of the search
+    :param n_actions: unused, as the other arguments of rl_zoo3
+    :param n_envs: unused
+    :param additional_args: unused
+    :return: constructor keywords
+    """
+    return convert_dce_params(
+        {
+            "beta": trial.suggest_float("beta", 0.03, 30.0, log=True),
+            "expectile": trial.suggest_float("expectile", 0.5, 0.95),
+            "learning_rate": trial.suggest_float("learning_rate", 1e-4, 1e-3, log=True),
+            "batch_size_pow": trial.suggest_int("batch_size_pow", 6, 10),
+            "one_minus_gamma": trial.suggest_float("one_minus_gamma", 1e-3, 3e-2, log=True),
+            "tau": trial.suggest_float("tau", 1e-3, 2e-2, log=True),
+        }
+    )
+
+
+def convert_dce_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param sampled_params: parameters of a trial, as drawn by :func:`sample_dce_params`
+    :return: constructor keywords; a schedule in the row is switched off, since it belongs to another start value
+    """
+    params = dict(sampled_params)
+    params["gamma"] = 1.0 - params.pop("one_minus_gamma")
+    params["batch_size"] = 2 ** params.pop("batch_size_pow")
+    return {**params, "beta_final": None, "beta_rate": 0.0}
+
+
+SAMPLERS: dict[str, Callable[..., dict[str, Any]]] = {
+    "dce": sample_dce_params,
+}
+CONVERTERS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+    "dce": convert_dce_params,
+}
+
+
+def register() -> dict[str, type[BaseAlgorithm]]:
+    """
+    Add the algorithms to rl_zoo3. Its modules share one dictionary, which is therefore changed in place.
+
+    :return: all algorithms rl_zoo3 knows now
+    :raises ModuleNotFoundError: without rl_zoo3
+    """
+    from rl_zoo3 import ALGOS
+    from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
+
+    ALGOS.update(ALGORITHMS)
+    HYPERPARAMS_SAMPLER.update(SAMPLERS)
+    HYPERPARAMS_CONVERTER.update(CONVERTERS)
+    return ALGOS
