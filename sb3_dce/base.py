@@ -7,6 +7,7 @@ callback keeps its meaning and an evaluation at step N sees exactly N updates.
 
 from __future__ import annotations
 
+import inspect
 import os
 import sys
 import time
@@ -76,14 +77,14 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         learning_rate: float | Schedule,
         *,
         batch_size: int,
-        tau: float,
-        gamma: float,
+        tau: float = 0.005,
+        gamma: float = 0.99,
         gradient_steps: int,
         d4rl_compat: bool,
         normalize_obs: bool,
-        reward_normalization: str | None,
-        reward_scale: float,
-        reward_shift: float,
+        reward_normalization: str | None = None,
+        reward_scale: float = 1.0,
+        reward_shift: float = 0.0,
         execution: str,
         stats_window_size: int,
         tensorboard_log: str | None,
@@ -249,6 +250,13 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
             except RuntimeError:  # saved on another kind of device
                 self._generator.manual_seed(0 if self.seed is None else self.seed)
         return self._generator
+
+    def hyperparameters(self) -> dict[str, Any]:
+        """
+        :return: constructor arguments in force, by name; environment and internal ones left out
+        """
+        names = [n for n in inspect.signature(type(self)).parameters if n not in ("policy", "env", "_init_setup_model")]
+        return {name: getattr(self, name) for name in names if hasattr(self, name)}
 
     # -- training --------------------------------------------------------------------------------------------------
 

@@ -186,3 +186,29 @@ def hinge(q_values: th.Tensor, values: th.Tensor) -> th.Tensor:
     :return: shape (..., batch, 1)
     """
     return F.relu(q_values - values)
+
+
+def bc_mse(actions_pi: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """
+    Squared error of behavioural cloning, a mean over batch and action dimensions.
+
+    :param actions_pi: the policy's actions, shape (..., batch, action_dim)
+    :param actions: actions of the data, shape (..., batch, action_dim)
+    :return: shape (...)
+    """
+    return batch_mean((actions_pi - actions).square())
+
+
+def bc_nll(mean: th.Tensor, log_std: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """
+    Negative log-likelihood of the data under the squashed Gaussian policy, nats.
+
+    :param mean: before squashing, shape (..., batch, action_dim)
+    :param log_std: shape (..., batch, action_dim)
+    :param actions: actions of the data in [-1, 1], clipped here to +-(1 - 1e-5), where atanh is finite
+    :return: shape (...)
+    """
+    actions = actions.clamp(-1.0 + 1e-5, 1.0 - 1e-5)
+    noise = (th.atanh(actions) - mean) / log_std.exp()
+    _, log_prob = squashed_gaussian(mean, log_std, noise)
+    return -batch_mean(log_prob)

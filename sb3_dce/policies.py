@@ -140,6 +140,25 @@ class OfflineSACPolicy(SACPolicy):
         return data
 
 
+class ActorPolicy(OfflineSACPolicy):
+    """The same policy with an actor only, for agents without critics; parameters as :class:`OfflineSACPolicy`."""
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        self.actor = self.make_actor()
+        self.actor.optimizer = self.optimizer_class(
+            self.actor.parameters(),
+            lr=lr_schedule(1),  # type: ignore[call-arg]
+            **self.optimizer_kwargs,
+        )
+
+    def set_training_mode(self, mode: bool) -> None:
+        """
+        :param mode: True for training, False for evaluation
+        """
+        self.actor.set_training_mode(mode)
+        self.training = mode
+
+
 def _refuse_batch_norm(policy: nn.Module) -> None:
     for module in policy.modules():
         if isinstance(module, nn.modules.batchnorm._BatchNorm):

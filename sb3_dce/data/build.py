@@ -16,7 +16,7 @@ import numpy as np
 from sb3_dce.data.catalog import DatasetSpec
 from sb3_dce.data.columns import ColumnSummary, copy_columns
 from sb3_dce.data.episodes import Episodes, d4rl_rows, fill_next_observations, find_episodes, usable_rows
-from sb3_dce.data.layout import ArraySource, RowLayout, check_layout, read_flags, row_blocks
+from sb3_dce.data.layout import WIDE_BLOCK_ROWS, ArraySource, RowLayout, check_layout, read_flags, row_blocks
 from sb3_dce.data.quality import (
     Findings,
     check_actions,
@@ -214,7 +214,7 @@ def _squeeze(rows: np.ndarray, used: np.ndarray) -> np.ndarray:
     end = 0
     if used.all():
         return rows
-    for block in row_blocks(len(rows)):
+    for block in row_blocks(len(rows), WIDE_BLOCK_ROWS):
         chosen = rows[block][used[block]]
         rows[end : end + len(chosen)] = chosen
         end += len(chosen)

@@ -20,6 +20,8 @@ CORE_KEYS = (*REQUIRED_KEYS, "timeouts", "next_observations")
 MATRIX_KEYS = ("observations", "actions", "next_observations")
 # Rows handled at once: 16k rows of HalfCheetah observations (1.1 MB) stay in the second-level cache.
 BLOCK_ROWS = 16_384
+# For copies of all columns: 344 kB of HalfCheetah, so that they do not count beside the row matrix.
+WIDE_BLOCK_ROWS = 2048
 MAX_ROWS = 2**31 - 1
 
 _NEAR_MISSES = {

@@ -12,7 +12,7 @@ import numpy as np
 
 from sb3_dce.data.columns import ColumnSummary
 from sb3_dce.data.episodes import MAX_JUMP_SHARE, Episodes, find_jumps, find_shift
-from sb3_dce.data.layout import RowLayout, row_blocks
+from sb3_dce.data.layout import WIDE_BLOCK_ROWS, RowLayout, row_blocks
 from sb3_dce.data.records import ReadOptions
 from sb3_dce.errors import DatasetSemanticsError
 
@@ -200,7 +200,7 @@ def check_duplicates(rows: np.ndarray, findings: Findings) -> None:
     """
     weights = np.random.default_rng(0).integers(0, 2**63, rows.shape[1], dtype=np.uint64) * np.uint64(2) + np.uint64(1)
     hashes = np.empty(len(rows), dtype=np.uint64)
-    for block in row_blocks(len(rows)):
+    for block in row_blocks(len(rows), WIDE_BLOCK_ROWS):
         hashes[block] = (rows[block].view(np.uint32) * weights).sum(axis=1)
     hashes.sort()
     share = float((hashes[1:] == hashes[:-1]).sum()) / len(rows)

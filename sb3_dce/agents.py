@@ -1,0 +1,24 @@
+"""The agents by the names they have in hyperparameter files, on the command line and in rl_zoo3."""
+
+from __future__ import annotations
+
+from sb3_dce.base import OfflineAlgorithm
+from sb3_dce.bc import OfflineBC
+from sb3_dce.dce import OfflineDCE
+from sb3_dce.errors import ConfigError
+from sb3_dce.hyperparams import did_you_mean
+
+AGENTS: dict[str, type[OfflineAlgorithm]] = {agent.algo_name: agent for agent in (OfflineDCE, OfflineBC)}
+
+
+def agent_class(algo: str) -> type[OfflineAlgorithm]:
+    """
+    :param algo: name such as ``dce`` or ``offline_bc``
+    :return: class of the agent
+    :raises ConfigError: for an unknown name
+    """
+    if algo not in AGENTS:
+        raise ConfigError(
+            f"unknown algorithm {algo!r}", key="algo", hint=f"{did_you_mean(algo, AGENTS)}Known: {', '.join(AGENTS)}."
+        )
+    return AGENTS[algo]

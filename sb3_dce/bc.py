@@ -1,0 +1,145 @@
+"""Behavioural cloning: the policy of the data, by regression or by maximum likelihood."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch as th
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
+
+from sb3_dce import losses
+from sb3_dce.attaching import DatasetLike
+from sb3_dce.base import OfflineAlgorithm
+from sb3_dce.checks import check_choice
+from sb3_dce.execution import Update
+from sb3_dce.noise import NoiseSpec
+from sb3_dce.policies import ActorPolicy
+from sb3_dce.state import PureNet, Storage
+from sb3_dce.steps import descend
+
+
+class OfflineBC(OfflineAlgorithm):
+    """
+    Behavioural cloning: ``mean((tanh(mu(s)) - a)^2)``, or ``-mean(log pi(a|s))`` of a squashed Gaussian.
+
+    Parameters not listed here are described in :class:`~sb3_dce.base.OfflineAlgorithm`.
+
+    :param bc_loss: ``"mse"`` trains the deterministic action (default), ``"nll"`` the whole distribution; its
+        log-probabilities need actions inside (-1, 1), so data are clipped to +-(1 - 1e-5) there
+    :param max_grad_norm: clip the gradient to this norm; ``None`` is off
+    """
+
+    algo_name: ClassVar[str] = "offline_bc"
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": ActorPolicy}
+    policy: ActorPolicy
+
+    def __init__(
+        self,
+        policy: str | type[ActorPolicy],
+        env: GymEnv | str | None = None,
+        dataset: DatasetLike | None = None,
+        learning_rate: float | Schedule = 3e-4,
+        batch_size: int = 256,
+        gradient_steps: int = 1,
+        bc_loss: str = "mse",
+        max_grad_norm: float | None = None,
+        d4rl_compat: bool = False,
+        normalize_obs: bool = False,
+        execution: str = "auto",
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            dataset,
+            learning_rate,
+            batch_size=batch_size,
+            gradient_steps=gradient_steps,
+            d4rl_compat=d4rl_compat,
+            normalize_obs=normalize_obs,
+            execution=execution,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            needs_env=_init_setup_model,
+        )
+        self.bc_loss = bc_loss
+        self.max_grad_norm = max_grad_norm
+        if _init_setup_model:
+            self._setup_model()
+
+    def check_parameters(self) -> None:
+        super().check_parameters()
+        check_choice("bc_loss", self.bc_loss, ("mse", "nll"))
+
+    def _create_aliases(self) -> None:
+        self.actor = self.policy.actor
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "actor"]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        modules, tensors = super()._get_torch_save_params()
+        return [*modules, "actor.optimizer"], tensors
+
+    def make_storages(self) -> dict[str, Storage]:
+        return {"actor": Storage(list(self.actor.parameters()), self.actor.optimizer)}
+
+    def make_update(self, storages: dict[str, Storage]) -> Update:
+        net, settings = PureNet(self.actor, "get_action_dist_params"), storages["actor"].settings
+        likelihood, max_grad_norm = self.bc_loss == "nll", self.max_grad_norm
+
+        def bc_update(state: Any, batch: Any, noise: Any, coef: Any) -> Any:
+            return update(likelihood, max_grad_norm, net, settings, state, batch, coef)
+
+        return bc_update
+
+    def noise_specs(self, batch_size: int) -> dict[str, NoiseSpec]:
+        return {}
+
+
+def update(
+    likelihood: bool,
+    max_grad_norm: float | None,
+    net: PureNet,
+    settings: Any,
+    state: dict[str, Any],
+    batch: ReplayBufferSamples,
+    coef: dict[str, th.Tensor],
+) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
+    """
+    One gradient step of behavioural cloning.
+
+    :param likelihood: maximise the likelihood instead of the squared error
+    :param max_grad_norm: clip the gradient to this norm
+    :param net: actor as a function of its flat parameters
+    :param settings: optimizer constants
+    :param state: learner "actor"
+    :param batch: tensors of shape (batch, ...); actions scaled to [-1, 1]
+    :param coef: 0-dimensional coefficients
+    :return: changed parts of the state, metrics
+    """
+
+    def loss(params: th.Tensor) -> tuple[th.Tensor, tuple[th.Tensor, th.Tensor]]:
+        mean, log_std, _ = net(params, batch.observations)
+        if likelihood:
+            return losses.bc_nll(mean, log_std, batch.actions), (mean, log_std)
+        return losses.bc_mse(th.tanh(mean), batch.actions), (mean, log_std)
+
+    actor, value, (mean, log_std), norm = descend(
+        loss, state["actor"], coef["learning_rate"], settings, max_grad_norm
+    )
+    metrics = {"bc_loss": value, "actor_loss": value, "grad_norm_actor": norm}
+    metrics["action_dist"] = (th.tanh(mean) - batch.actions).abs().mean()
+    metrics["log_std"] = log_std.mean()
+    return {"actor": actor}, metrics

@@ -1,0 +1,213 @@
+"""Evaluation of a policy in its dataset's environment, with the protocol of the result tables."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_dce.data.catalog import normalized_score, resolve
+from sb3_dce.envs import SpacesEnv, make_env_if_possible
+from sb3_dce.errors import ConfigError, DatasetError
+from sb3_dce.files import write_atomically
+
+# Seeds of two evaluations must not overlap; no evaluation has more episodes than this.
+SEEDS_PER_EVALUATION = 10_000
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """
+    Outcome of one evaluation.
+
+    :param n_updates: gradient steps the policy had seen
+    :param returns: undiscounted return of each episode, reward units
+    :param lengths: steps of each episode
+    :param dataset_id: catalogue id that defines the score, or ``None``
+    """
+
+    n_updates: int
+    returns: tuple[float, ...]
+    lengths: tuple[int, ...]
+    dataset_id: str | None
+
+    @property
+    def mean(self) -> float:
+        """
+        :return: mean return
+        """
+        return float(np.mean(self.returns))
+
+    @property
+    def std(self) -> float:
+        """
+        :return: standard deviation over the episodes
+        """
+        return float(np.std(self.returns))
+
+    @property
+    def score(self) -> float | None:
+        """
+        :return: D4RL's normalised score of the mean return (100 = expert), ``None`` without reference values
+        """
+        return None if self.dataset_id is None else float(normalized_score(self.dataset_id, self.mean))
+
+
+def catalogue_id(dataset: str | None) -> str | None:
+    """
+    :param dataset: id or file name
+    :return: id of the catalogue, ``None`` if it is not in there
+    """
+    if dataset is None:
+        return None
+    try:
+        return resolve(Path(dataset).stem if dataset.endswith((".hdf5", ".h5")) else dataset).id
+    except DatasetError:
+        return None
+
+
+def make_eval_env(dataset_id: str, n_episodes: int) -> DummyVecEnv | None:
+    """
+    One environment per episode, so that short episodes are not over-represented.
+
+    :param dataset_id: id of the catalogue
+    :param n_episodes: number of environments
+    :return: vectorised environment, or ``None`` where the simulator is not installed
+    """
+    if isinstance(make_env_if_possible(dataset_id).unwrapped, SpacesEnv):
+        return None
+    return DummyVecEnv([lambda: Monitor(make_env_if_possible(dataset_id)) for _ in range(n_episodes)])
+
+
+def evaluate(model: Any, env: DummyVecEnv, n_episodes: int, seed: int, dataset_id: str | None = None) -> Evaluation:
+    """
+    Deterministic episodes with fixed seeds.
+
+    :param model: anything with ``predict``; its ``_n_updates`` is recorded if it has one
+    :param env: vectorised environment
+    :param n_episodes: episodes
+    :param seed: seed of the first environment
+    :param dataset_id: defines the score
+    :return: returns and lengths
+    """
+    env.seed(seed)
+    returns, lengths = evaluate_policy(
+        model, env, n_eval_episodes=n_episodes, deterministic=True, return_episode_rewards=True, warn=False
+    )
+    assert isinstance(returns, list) and isinstance(lengths, list)
+    return Evaluation(int(getattr(model, "_n_updates", 0)), tuple(map(float, returns)), tuple(map(int, lengths)), dataset_id)
+
+
+class EvaluationCallback(BaseCallback):
+    """
+    Evaluate every so many gradient steps; write ``evaluations.npz`` (Stable-Baselines3's layout) and ``evaluations.csv``.
+
+    The seeds are a function of the run's seed and the number of the evaluation, and the training generator is not
+    touched: a run gives the same weights with and without evaluation, and the same evaluations after a resume. There is
+    no "best model": choosing one by online evaluation is not an offline result.
+
+    :param env: vectorised environment; ``None`` evaluates nothing
+    :param dataset_id: defines the score
+    :param eval_freq: gradient steps between two evaluations
+    :param n_eval_episodes: episodes of each
+    :param seed: seed of the run
+    :param folder: where the files are written; earlier evaluations found there are kept
+    :param on_evaluation: called with each outcome
+    :param save_checkpoint: write ``checkpoint.zip`` after each evaluation
+    """
+
+    def __init__(
+        self,
+        env: DummyVecEnv | None,
+        dataset_id: str | None,
+        eval_freq: int,
+        n_eval_episodes: int = 10,
+        seed: int = 0,
+        folder: Path | None = None,
+        on_evaluation: Callable[[Evaluation], None] | None = None,
+        save_checkpoint: bool = False,
+    ) -> None:
+        super().__init__()
+        if eval_freq < 1 or n_eval_episodes < 1:
+            raise ConfigError(
+                f"eval_freq and the number of episodes must be at least 1, got {eval_freq} and {n_eval_episodes}",
+                key="eval_freq",
+                hint="Use 5000 and 10.",
+            )
+        self.env = env
+        self.dataset_id = dataset_id
+        self.eval_freq = eval_freq
+        self.n_eval_episodes = n_eval_episodes
+        self.seed = seed
+        self.folder = folder
+        self.on_evaluation = on_evaluation
+        self.save_checkpoint = save_checkpoint
+        self.evaluations: list[Evaluation] = [] if folder is None else read_evaluations(folder, dataset_id)
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps % self.eval_freq == 0:
+            if self.env is not None:
+                self._evaluate(self.env)
+            if self.save_checkpoint and self.folder is not None:
+                self.model.save(self.folder / "checkpoint.zip")
+        return True
+
+    def _evaluate(self, env: DummyVecEnv) -> None:
+        index = self.num_timesteps // self.eval_freq
+        seed = SEEDS_PER_EVALUATION * (index + 1000 * self.seed)
+        outcome = evaluate(self.model, env, self.n_eval_episodes, seed, self.dataset_id)
+        kept = [e for e in self.evaluations if e.n_updates < outcome.n_updates]
+        self.evaluations = [*kept, outcome]
+        self.logger.record("eval/mean_reward", outcome.mean)
+        self.logger.record("eval/mean_ep_length", float(np.mean(outcome.lengths)))
+        if outcome.score is not None:
+            self.logger.record("eval/normalized_score", outcome.score)
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)
+        if self.folder is not None:
+            write_evaluations(self.folder, self.evaluations)
+        if self.on_evaluation is not None:
+            self.on_evaluation(outcome)
+
+
+def write_evaluations(folder: Path, evaluations: list[Evaluation]) -> None:
+    """
+    :param folder: existing folder
+    :param evaluations: all evaluations of the run
+    """
+    with write_atomically(folder / "evaluations.npz") as stream:
+        np.savez(
+            stream,
+            timesteps=[e.n_updates for e in evaluations],
+            results=[e.returns for e in evaluations],
+            ep_lengths=[e.lengths for e in evaluations],
+        )
+    with (folder / "evaluations.csv").open("w", newline="", encoding="utf-8") as text:
+        writer = csv.writer(text)
+        writer.writerow(["n_updates", "episodes", "mean_return", "std_return", "normalized_score", "mean_length"])
+        for e in evaluations:
+            score = "" if e.score is None else round(e.score, 4)
+            length = round(float(np.mean(e.lengths)), 2)
+            writer.writerow([e.n_updates, len(e.returns), round(e.mean, 4), round(e.std, 4), score, length])
+
+
+def read_evaluations(folder: Path, dataset_id: str | None) -> list[Evaluation]:
+    """
+    :param folder: folder of a run
+    :param dataset_id: defines the score
+    :return: its evaluations so far
+    """
+    path = folder / "evaluations.npz"
+    if not path.is_file():
+        return []
+    with np.load(path, allow_pickle=False) as data:
+        rows = zip(data["timesteps"], data["results"], data["ep_lengths"], strict=True)
+        return [Evaluation(int(n), tuple(map(float, r)), tuple(map(int, e)), dataset_id) for n, r, e in rows]

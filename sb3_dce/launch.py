@@ -1,0 +1,115 @@
+"""Many runs at once: one process per core, with a progress bar for each and the evaluations as they come."""
+
+from __future__ import annotations
+
+import multiprocessing as mp
+import os
+import queue
+import traceback
+from collections.abc import Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from sb3_dce import runs
+from sb3_dce.errors import SB3DCEError
+from sb3_dce.runs import RunSpec
+
+
+class RunFailedError(SB3DCEError):
+    """A run ended with an unexpected error; its traceback is in ``error.txt`` of the run's folder."""
+
+
+def launch(specs: Sequence[RunSpec], workers: int, console: Console) -> list[dict[str, Any]]:
+    """
+    Run all, in parallel processes.
+
+    :param specs: what is to be run
+    :param workers: processes at a time
+    :param console: where progress and evaluations are shown
+    :return: results in the order of ``specs``
+    :raises SB3DCEError: the first error of a run; what the others have done is kept and resumed by the same call
+    """
+    workers = max(1, min(workers, len(specs)))
+    threads = max(1, (os.cpu_count() or 1) // workers)
+    context = mp.get_context("spawn")
+    with context.Manager() as manager, _display(console) as display:
+        events = manager.Queue()
+        # A pool of processes that end with their work: each run frees its memory.
+        with ProcessPoolExecutor(workers, mp_context=context, initializer=_prepare, initargs=(threads,)) as pool:
+            futures = [pool.submit(_run, spec, events) for spec in specs]
+            try:
+                _show_until_done(futures, events, specs, display)
+                return [future.result() for future in futures]
+            except BaseException:
+                # Without this an error or Ctrl-C would wait for every other run to finish.
+                for future in futures:
+                    future.cancel()
+                for process in list(pool._processes.values()):
+                    process.terminate()
+                raise
+
+
+def _display(console: Console) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("updates"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=console,
+        # A log file gets the evaluations and the final state, not one line per repaint.
+        refresh_per_second=4 if console.is_terminal else 0.02,
+    )
+
+
+def _show_until_done(futures: list[Future[Any]], events: Any, specs: Sequence[RunSpec], display: Progress) -> None:
+    tasks: dict[str, TaskID] = {}
+    totals = {spec.name: spec.n_updates for spec in specs}
+    while True:
+        try:
+            event = events.get(timeout=0.2)
+        except queue.Empty:
+            failed = [future for future in futures if future.done() and future.exception() is not None]
+            if failed:
+                failed[0].result()
+            if all(future.done() for future in futures):
+                return
+            continue
+        if event.name not in tasks:
+            tasks[event.name] = display.add_task(event.name, total=totals[event.name])
+        display.update(tasks[event.name], completed=event.n_updates)
+        if event.evaluation is not None:
+            outcome = event.evaluation
+            score = "" if outcome.score is None else f"   score {outcome.score:6.1f}"
+            display.console.print(
+                f"  {event.name:<18} @{outcome.n_updates:>8,}   return {outcome.mean:8.1f} ± {outcome.std:6.1f}{score}",
+                highlight=False,
+            )
+
+
+def _prepare(threads: int) -> None:
+    import torch as th
+
+    th.set_num_threads(threads)
+
+
+def _run(spec: RunSpec, events: Any) -> dict[str, Any]:
+    try:
+        return runs.run(spec, events.put)
+    except SB3DCEError:
+        raise
+    except Exception as error:
+        folder = Path(spec.folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
+        raise RunFailedError(
+            f"{spec.name} failed: {type(error).__name__}: {error}",
+            where=str(folder),
+            hint="The whole report is in error.txt there; the same command resumes the run from its last checkpoint.",
+        ) from None

@@ -1,0 +1,209 @@
+"""One training run in one folder: configuration, log, evaluations, checkpoint, final model. It can be killed and resumed."""
+
+from __future__ import annotations
+
+import json
+import platform
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+import yaml
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger, make_output_format
+
+import sb3_dce
+from sb3_dce.agents import agent_class
+from sb3_dce.base import OfflineAlgorithm
+from sb3_dce.data import find_file
+from sb3_dce.data.hashes import file_sha256
+from sb3_dce.evaluation import Evaluation, EvaluationCallback, catalogue_id, make_eval_env, write_evaluations
+from sb3_dce.files import write_atomically
+
+# Seconds between two progress reports.
+REPORT_INTERVAL = 0.5
+
+
+@dataclass(frozen=True)
+class RunSpec:
+    """
+    What is to be run.
+
+    :param algo: name of the agent
+    :param dataset: id or file
+    :param seed: fixes networks, batches, noise and evaluation episodes
+    :param n_updates: gradient steps
+    :param folder: where everything is written
+    :param eval_freq: gradient steps between two evaluations (and checkpoints)
+    :param n_eval_episodes: episodes of each evaluation
+    :param overrides: constructor arguments that replace those of the dataset's row
+    """
+
+    algo: str
+    dataset: str
+    seed: int
+    n_updates: int
+    folder: str
+    eval_freq: int = 5000
+    n_eval_episodes: int = 10
+    overrides: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """
+        :return: short name for displays
+        """
+        return f"{self.algo} seed {self.seed}"
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Report of a run while it works: ``evaluation`` is set when there is a new one."""
+
+    name: str
+    n_updates: int
+    total: int
+    evaluation: Evaluation | None = None
+
+
+Report = Callable[[Progress], None]
+
+
+class _ReportCallback(BaseCallback):
+    def __init__(self, spec: RunSpec, report: Report) -> None:
+        super().__init__()
+        self._spec, self._report, self._next = spec, report, 0.0
+
+    def _on_step(self) -> bool:
+        now = time.monotonic()
+        if now >= self._next or self.num_timesteps == self._spec.n_updates:
+            self._next = now + REPORT_INTERVAL
+            self._report(Progress(self._spec.name, self.num_timesteps, self._spec.n_updates))
+        return True
+
+
+def run(spec: RunSpec, report: Report = lambda progress: None) -> dict[str, Any]:
+    """
+    Train, evaluate and save; go on from the last checkpoint if there is one; do nothing if the run is complete.
+
+    :param spec: what is to be run
+    :param report: called with the progress
+    :return: the result, also written as ``result.json``
+    :raises SB3DCEError: if something is wrong with data, parameters or files
+    """
+    folder = Path(spec.folder)
+    done = read_result(folder)
+    if done is not None and done["n_updates"] == spec.n_updates and done["config"] == _config(spec):
+        return done
+    folder.mkdir(parents=True, exist_ok=True)
+    model = _model(spec, folder)
+    dataset_id = catalogue_id(model.dataset)
+    _write_config(spec, model, folder)
+    model.set_logger(Logger(str(folder), [make_output_format("csv", str(folder), f"_{model.num_timesteps}")]))
+
+    def on_evaluation(outcome: Evaluation) -> None:
+        report(Progress(spec.name, model.num_timesteps, spec.n_updates, outcome))
+
+    env = None if dataset_id is None else make_eval_env(dataset_id, spec.n_eval_episodes)
+    evaluating = EvaluationCallback(
+        env, dataset_id, spec.eval_freq, spec.n_eval_episodes, spec.seed, folder, on_evaluation, save_checkpoint=True
+    )
+    evaluating.evaluations = [e for e in evaluating.evaluations if e.n_updates <= model.num_timesteps]
+    started, seconds_before = time.monotonic(), _seconds_before(folder)
+    remaining = spec.n_updates - model.num_timesteps
+    if remaining > 0:
+        model.learn(remaining, callback=[evaluating, _ReportCallback(spec, report)], reset_num_timesteps=False)
+    seconds = seconds_before + time.monotonic() - started
+    model.save(folder / "model.zip")
+    write_evaluations(folder, evaluating.evaluations)
+    last = evaluating.evaluations[-1] if evaluating.evaluations else None
+    result = {
+        "config": _config(spec),
+        "n_updates": spec.n_updates,
+        "seconds": round(seconds, 1),
+        "returns": None if last is None else list(last.returns),
+        "mean_return": None if last is None else last.mean,
+        "normalized_score": None if last is None else last.score,
+        "evaluated_at": None if last is None else last.n_updates,
+    }
+    _write_text(folder / "result.json", json.dumps(result, indent=1))
+    (folder / "checkpoint.zip").unlink(missing_ok=True)
+    return result
+
+
+def read_result(folder: Path) -> dict[str, Any] | None:
+    """
+    :param folder: folder of a run
+    :return: its result, ``None`` if it is not complete
+    """
+    path = folder / "result.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+
+
+def _config(spec: RunSpec) -> dict[str, Any]:
+    return {key: value for key, value in asdict(spec).items() if key != "folder"}
+
+
+def _model(spec: RunSpec, folder: Path) -> OfflineAlgorithm:
+    agent = agent_class(spec.algo)
+    checkpoint = folder / "checkpoint.zip"
+    if checkpoint.is_file():
+        return agent.load(checkpoint)
+    model = agent.load_dataset(spec.dataset, seed=spec.seed, **spec.overrides)
+    model.num_timesteps = 0
+    return model
+
+
+def _seconds_before(folder: Path) -> float:
+    """Training seconds of earlier sittings, from the log files."""
+    total = 0.0
+    for path in folder.glob("progress_*.csv"):
+        with path.open(encoding="utf-8") as text:
+            header = text.readline().strip().split(",")
+            if "time/time_elapsed" not in header:
+                continue
+            column = header.index("time/time_elapsed")
+            values = [line.split(",")[column] for line in text if line.count(",") >= column]
+        total += max((float(v) for v in values if v), default=0.0)
+    return total
+
+
+def _write_config(spec: RunSpec, model: OfflineAlgorithm, folder: Path) -> None:
+    model.attach_dataset()
+    assert model.dataset is not None
+    path, _ = find_file(model.dataset)
+    hyperparameters = {name: _plain(value) for name, value in model.hyperparameters().items()}
+    config = {
+        "run": _config(spec),
+        "command": " ".join(["sb3-dce", *sys.argv[1:]]) if Path(sys.argv[0]).name == "sb3-dce" else None,
+        "dataset": {"name": model.dataset, "sha256": file_sha256(path), **(model.dataset_statistics or {})},
+        "hyperparameters": hyperparameters,
+        "versions": {
+            "sb3_dce": sb3_dce.__version__,
+            "python": platform.python_version(),
+            **{name: version(name) for name in ("torch", "stable-baselines3", "gymnasium", "mujoco", "numpy")},
+        },
+        "machine": {"processor": platform.machine(), "device": str(model.device), "threads": th.get_num_threads()},
+    }
+    _write_text(folder / "config.yml", yaml.safe_dump(config, sort_keys=False))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return value.item()
+    return value if value is None or isinstance(value, bool | int | float | str) else repr(value)
+
+
+def _write_text(path: Path, text: str) -> None:
+    with write_atomically(path) as stream:
+        stream.write(text.encode())

@@ -1,0 +1,148 @@
+"""What ``sb3-dce train`` and ``sb3-dce evaluate`` do: runs over seeds, a table, a plot."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from sb3_dce import hyperparams
+from sb3_dce.agents import AGENTS, agent_class
+from sb3_dce.data import find_file
+from sb3_dce.data.catalog import resolve
+from sb3_dce.errors import CheckpointError, ConfigError
+from sb3_dce.evaluation import Evaluation, catalogue_id, evaluate, make_eval_env, read_evaluations
+from sb3_dce.launch import launch
+from sb3_dce.plots import plot_learning_curves
+from sb3_dce.runs import RunSpec
+
+
+def train_seeds(
+    algo: str,
+    dataset: str,
+    n_updates: int | None,
+    seeds: Sequence[int],
+    eval_freq: int,
+    n_eval_episodes: int,
+    workers: int,
+    out: Path | None,
+    overrides: dict[str, Any],
+    console: Console,
+) -> list[dict[str, Any]]:
+    """
+    Train one agent with several seeds; show the progress, the results and where they are.
+
+    :param algo: name of the agent
+    :param dataset: id or file
+    :param n_updates: gradient steps; ``None`` takes those of the dataset's row
+    :param seeds: seeds
+    :param eval_freq: gradient steps between two evaluations
+    :param n_eval_episodes: episodes of each
+    :param workers: processes
+    :param out: folder of the results
+    :param overrides: constructor arguments that replace those of the row
+    :param console: where to print
+    :return: results, one per seed
+    """
+    agent = agent_class(algo)
+    hyperparams.check_keys(agent, overrides, where="--set")
+    path, spec = find_file(dataset)
+    rows = hyperparams.read_rows(algo)
+    row = rows["default"] if spec is None else hyperparams.load_row(algo, spec.id)
+    total = n_updates or hyperparams.split_row(row).n_timesteps
+    name = path.stem if spec is None else spec.id
+    folder = out or Path("runs") / f"{algo}-{name}"
+    console.print(f"[b]{algo}[/b] on [b]{name}[/b] ({path}), {total:,} gradient steps, seeds {list(seeds)}")
+    specs = [
+        RunSpec(algo, dataset, seed, total, str(folder / f"seed_{seed}"), eval_freq, n_eval_episodes, overrides)
+        for seed in seeds
+    ]
+    results = launch(specs, workers, console)
+    show_results({algo: results}, console)
+    curves = {algo: [read_evaluations(Path(s.folder), None if spec is None else spec.id) for s in specs]}
+    picture = plot_learning_curves(curves, folder / "learning_curve.png", title=name)
+    console.print(f"saved  {folder}/seed_*/model.zip, config.yml, evaluations.csv" + (f", {picture.name}" if picture else ""))
+    console.print(f"next   sb3-dce evaluate {specs[0].folder}/model.zip", markup=False)
+    return results
+
+
+def show_results(results: dict[str, list[dict[str, Any]]], console: Console) -> None:
+    """
+    :param results: per agent the results of its seeds
+    :param console: where to print
+    """
+    table = Table(box=None, header_style="bold")
+    for title in ("agent", "seed", "return (last evaluation)", "normalised score", "train s"):
+        table.add_column(title, justify="left" if title == "agent" else "right")
+    for name, rows in results.items():
+        for row in rows:
+            if row["returns"] is None:
+                cells = ("no simulator", "-")
+            else:
+                score = row["normalized_score"]
+                cells = (
+                    f"{np.mean(row['returns']):.1f} ± {np.std(row['returns']):.1f}",
+                    "-" if score is None else f"{score:.1f}",
+                )
+            table.add_row(name, str(row["config"]["seed"]), *cells, f"{row['seconds']:.0f}")
+    console.print(table)
+
+
+def evaluate_file(model_path: Path, dataset: str | None, n_episodes: int, seed: int) -> Evaluation:
+    """
+    :param model_path: zip file of an agent
+    :param dataset: id that names environment and score; ``None`` takes the model's own
+    :param n_episodes: episodes
+    :param seed: seed of the first episode
+    :return: outcome
+    :raises CheckpointError: if the file is not a model of this package
+    :raises ConfigError: if no environment is known or installed
+    """
+    model = load_any(model_path)
+    dataset_id = resolve(dataset).id if dataset is not None else catalogue_id(model.dataset)
+    if dataset_id is None:
+        raise ConfigError(
+            f"the model was trained on {model.dataset!r}, which is not in the catalogue: its environment is unknown",
+            key="dataset",
+            hint="Name one with --dataset, for example --dataset halfcheetah-medium.",
+        )
+    env = make_eval_env(dataset_id, n_episodes)
+    if env is None:
+        raise ConfigError(
+            f"the simulator of {dataset_id} is not installed",
+            key="env",
+            hint='Install it: pip install mujoco, or pip install "sb3_dce[robotics]" for Adroit and Kitchen.',
+        )
+    return evaluate(model, env, n_episodes, seed, dataset_id)
+
+
+def load_any(path: Path) -> Any:
+    """
+    Load a model of whichever agent it is.
+
+    :param path: zip file
+    :return: model
+    :raises CheckpointError: if the file is not there, damaged, or no model of this package
+    """
+    if not path.is_file():
+        raise CheckpointError("no such file", where=str(path), path=path, hint="Give the path of a model.zip.")
+    for agent in AGENTS.values():
+        try:
+            return agent.load(path)
+        except zipfile.BadZipFile as error:
+            raise CheckpointError(
+                f"not a zip file ({error})", where=str(path), path=path, hint="Give a model saved by this package."
+            ) from error
+        except (CheckpointError, ConfigError, ValueError, KeyError, TypeError, AssertionError, RuntimeError):
+            continue
+    raise CheckpointError(
+        f"no agent of this package can load it; known are {', '.join(AGENTS)}",
+        where=str(path),
+        path=path,
+        hint="Load models of other packages with their own classes.",
+    )

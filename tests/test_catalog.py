@@ -1,0 +1,159 @@
+"""Names, reference scores, and the search for files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from sb3_dce.data import all_specs, available, find_file, normalized_score, resolve, spec_of_file
+from sb3_dce.data.catalog import D4RL_URL
+from sb3_dce.data.locate import cache_folder, is_path
+from sb3_dce.errors import DatasetError, DatasetNotFoundError
+
+
+@pytest.fixture(autouse=True)
+def empty_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A machine without datasets, but for those of the package."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for variable in ("SB3_DCE_DATASETS", "XDG_CACHE_HOME", "D4RL_DATASET_DIR"):
+        monkeypatch.delenv(variable, raising=False)
+    return tmp_path
+
+
+def touch(path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(b"")
+    return path
+
+
+def test_catalogue_holds_the_papers_datasets_once() -> None:
+    paper = Path(__file__).parent / "data" / "paper_config.csv"
+    ids = [line.split(",")[0] for line in paper.read_text().splitlines()[1:] if line]
+    assert len(ids) == 23
+    known = [spec.id for spec in all_specs()]
+    assert len(known) == len(set(known)) and set(ids) <= set(known)
+    assert {spec.paper_row for spec in all_specs()} == set(ids)
+    assert all(resolve(dataset_id).paper_row == dataset_id for dataset_id in ids)
+
+
+def test_generated_data_never_carry_an_official_id() -> None:
+    for spec in all_specs():
+        assert spec.generated == spec.id.endswith("-sb3") == (spec.url is None)
+        if spec.url is not None:
+            assert spec.url.startswith(D4RL_URL) and spec.url.endswith(f"/{spec.file_name}")
+        assert spec.embedded == (spec.sha256 is not None)
+
+
+@pytest.mark.parametrize(
+    ("name", "dataset_id"),
+    [
+        ("walker2d-medium", "walker2d-medium-v2"),
+        ("halfcheetah_medium_replay-v2", "halfcheetah-medium-replay-v2"),
+        ("pen-human", "pen-human-v0"),
+        ("pen-human-v1", "pen-human-v1"),
+        ("door-expert", "door-expert-v1"),
+        ("kitchen_mixed", "kitchen-mixed-v0"),
+        ("Hopper-Random-v2", "hopper-random-v2"),
+        ("halfcheetah-demo-sb3", "halfcheetah-demo-sb3"),
+    ],
+)
+def test_aliases_complete_the_version(name: str, dataset_id: str) -> None:
+    assert resolve(name).id == dataset_id
+
+
+def test_unknown_name_lists_close_matches() -> None:
+    with pytest.raises(DatasetError, match="walker2d-medium-v2.*all_specs"):
+        resolve("waker2d-medium-v2")
+
+
+@pytest.mark.parametrize(
+    ("file", "dataset_id"),
+    [
+        ("folder/halfcheetah_medium-v2.hdf5", "halfcheetah-medium-v2"),
+        ("halfcheetah-medium-v2.hdf5", "halfcheetah-medium-v2"),
+        ("pen-v0_demos_clipped.hdf5", "pen-human-v0"),
+        ("halfcheetah-medium-sb3.hdf5", "halfcheetah-medium-sb3"),
+        ("mine.hdf5", None),
+    ],
+)
+def test_file_name_tells_the_dataset(file: str, dataset_id: str | None) -> None:
+    spec = spec_of_file(file)
+    assert (spec.id if spec else None) == dataset_id
+
+
+# Values of data.md section 1, computed from D4RL's constants.
+@pytest.mark.parametrize(
+    ("name", "at_0", "at_1000"),
+    [
+        ("halfcheetah-medium", 2.256745, 10.311402),
+        ("hopper-medium", 0.622887, 31.348890),
+        ("walker2d-medium", -0.035485, 21.747823),
+        ("pen-human", -3.229677, None),
+        ("hammer-human", 2.103120, None),
+        ("door-human", 1.924115, None),
+        ("relocate-human", 0.151544, None),
+    ],
+)
+def test_normalized_score_has_the_factor_100(name: str, at_0: float, at_1000: float | None) -> None:
+    spec = resolve(name)
+    assert normalized_score(name, 0) == pytest.approx(at_0, abs=1e-6)
+    if at_1000 is not None:
+        assert normalized_score(name, 1000) == pytest.approx(at_1000, abs=1e-6)
+    scores = normalized_score(name, np.array([[spec.ref_min_score], [spec.ref_max_score]]))
+    assert scores.shape == (2, 1) and np.allclose(scores[:, 0], [0, 100])
+
+
+def test_kitchen_score_is_the_share_of_four_tasks() -> None:
+    assert normalized_score("kitchen-partial-v0", 2) == 50.0
+    assert isinstance(normalized_score("kitchen-partial-v0", 2), float)
+
+
+def test_folders_are_searched_in_order(empty_machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = "hopper_medium-v2.hdf5"
+    home_file = touch(empty_machine / ".d4rl" / "datasets" / name)
+    assert find_file("hopper-medium") == (home_file, resolve("hopper-medium"))
+    monkeypatch.setenv("D4RL_DATASET_DIR", str(empty_machine / "d4rl"))
+    d4rl_file = touch(empty_machine / "d4rl" / name)
+    assert find_file("hopper-medium")[0] == d4rl_file
+    monkeypatch.setenv("XDG_CACHE_HOME", str(empty_machine / "xdg"))
+    cached = touch(cache_folder() / name)
+    assert cached.is_relative_to(empty_machine / "xdg") and find_file("hopper-medium")[0] == cached
+    own = touch(empty_machine / "b" / "hopper-medium-v2.hdf5")
+    monkeypatch.setenv("SB3_DCE_DATASETS", f"{empty_machine / 'a'}:{empty_machine / 'b'}")
+    assert find_file("hopper-medium")[0] == own
+    assert ("hopper-medium-v2", own) in [(spec.id, path) for spec, path in available()]
+
+
+def test_path_wins_over_name(empty_machine: Path) -> None:
+    file = touch(empty_machine / "halfcheetah-medium-sb3.hdf5")
+    assert find_file(str(file)) == (file, resolve("halfcheetah-medium-sb3"))
+    assert find_file(touch(empty_machine / "mine.h5")) == (empty_machine / "mine.h5", None)
+    assert is_path("x/y") and is_path("x.hdf5") and is_path(Path("x")) and not is_path("hopper-medium")
+
+
+def test_missing_path_is_reported() -> None:
+    with pytest.raises(DatasetNotFoundError, match="nowhere.hdf5: no such file"):
+        find_file("nowhere.hdf5")
+
+
+def test_missing_official_file_is_never_replaced_by_a_stand_in(
+    empty_machine: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = empty_machine / "mine"
+    monkeypatch.setenv("SB3_DCE_DATASETS", str(folder))
+    touch(folder / "walker2d-medium-sb3.hdf5")
+    with pytest.raises(DatasetNotFoundError) as caught:
+        find_file("walker2d-medium")
+    text, spec = str(caught.value), resolve("walker2d-medium")
+    for part in (spec.url, str(folder / spec.file_name), "walker2d-medium-sb3", ".d4rl", "halfcheetah-demo-sb3"):
+        assert part is not None and part in text
+    assert isinstance(caught.value, FileNotFoundError) and caught.value.key == spec.id
+
+
+def test_embedded_files_need_no_folder() -> None:
+    path, spec = find_file("halfcheetah-tiny-sb3")
+    assert spec is not None and spec.embedded and h5py.is_hdf5(path)
+    assert {"halfcheetah-tiny-sb3", "halfcheetah-demo-sb3"} == {spec.id for spec, _ in available()}

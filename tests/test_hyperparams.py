@@ -1,0 +1,161 @@
+"""The YAML files: well-formed, made of constructor parameters, and equal to the paper's configuration table."""
+
+from __future__ import annotations
+
+import csv
+import inspect
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pytest
+
+from sb3_dce import hyperparams
+from sb3_dce.data import catalog
+from sb3_dce.errors import ConfigError, DatasetError
+from sb3_dce.schedules import StepSchedule
+from sb3_dce.zoo.registry import ALGORITHMS
+
+DATA = Path(__file__).parent / "data"
+
+
+def _table(name: str) -> list[dict[str, str]]:
+    with (DATA / name).open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+PAPER = _table("paper_config.csv")
+BETAS = {
+    row["dataset"]: [float(value) for key, value in row.items() if key != "dataset"] for row in _table("beta_schedules.csv")
+}
+ROWS = [(algo, name, row) for algo in ALGORITHMS for name, row in hyperparams.read_rows(algo).items()]
+all_rows = pytest.mark.parametrize(("algo", "name", "row"), ROWS, ids=[f"{algo}-{name}" for algo, name, _ in ROWS])
+
+
+def _schedule(row: dict[str, Any]) -> StepSchedule:
+    return StepSchedule(row["beta"], row["beta_final"], row["beta_rate"], row["beta_update_every"] * row["steps_per_epoch"])
+
+
+@all_rows
+def test_row_says_how_long_to_train_which_policy(algo: str, name: str, row: dict[str, Any]) -> None:
+    arguments, n_timesteps, zoo = hyperparams.split_row(row)
+    assert n_timesteps == 1_000_000
+    assert arguments["policy"] == "MlpPolicy"
+    assert zoo == {}
+
+
+@all_rows
+def test_numbers_are_not_read_as_text(algo: str, name: str, row: dict[str, Any]) -> None:
+    text = {key for key, value in row.items() if isinstance(value, str)}
+    assert text <= {"policy", "dataset", "ent_coef"}
+    assert isinstance(row["learning_rate"], float)
+    assert row.get("ent_coef", "auto") == "auto" or isinstance(row["ent_coef"], float)
+
+
+@all_rows
+def test_keys_are_constructor_parameters_or_known_to_the_zoo(algo: str, name: str, row: dict[str, Any]) -> None:
+    parameters = inspect.signature(ALGORITHMS[algo]).parameters
+    assert set(row) <= {*parameters, *hyperparams.ZOO_KEYS}
+    hyperparams.check_keys(ALGORITHMS[algo], row)
+
+
+@all_rows
+def test_row_name_is_its_dataset_a_catalogue_id_and_an_environment(algo: str, name: str, row: dict[str, Any]) -> None:
+    if name == "default":
+        assert "dataset" not in row
+    else:
+        assert row["dataset"] == name == catalog.resolve(name).id
+        assert name in gym.registry
+
+
+@all_rows
+def test_row_builds_a_model_that_survives_saving(algo: str, name: str, row: dict[str, Any], tmp_path: Path) -> None:
+    arguments, _, _ = hyperparams.split_row({"dataset": "hopper-medium-v2", **row})
+    cls = ALGORITHMS[algo]
+    cls(**arguments, device="cpu").save(tmp_path / "model")
+    loaded = cls.load(tmp_path / "model", device="cpu")
+    for key, value in arguments.items():
+        # the policy is an object by now, the learning rate a schedule
+        if key not in ("policy", "learning_rate"):
+            assert getattr(loaded, key) == value
+
+
+def test_dce_rows_are_those_of_the_paper() -> None:
+    assert set(hyperparams.read_rows("dce")) == {row["dataset"] for row in PAPER} | {"default"}
+    assert len(PAPER) == 23
+
+
+@pytest.mark.parametrize("paper", PAPER, ids=[row["dataset"] for row in PAPER])
+def test_dce_row_has_the_papers_values(paper: dict[str, str]) -> None:
+    row = hyperparams.load_row("dce", paper["dataset"])
+    ent_coef = paper["ent_coef"]
+    assert row["ent_coef"] == (ent_coef if ent_coef == "auto" else float(ent_coef))
+    assert row["beta"] == float(paper["beta_start"])
+    assert row.get("critic_dropout", 0.0) == (0.1 if "-human-" in paper["dataset"] else 0.0)
+    common = {"learning_rate": 3e-4, "gamma": 0.99, "tau": 0.005, "expectile": 0.7, "td_loss_coef": 1.0, "batch_size": 256}
+    assert {key: row[key] for key in common} == common
+    assert row["policy_kwargs"] == {"net_arch": [256, 256]}
+
+
+@pytest.mark.parametrize("dataset", BETAS)
+def test_dce_row_reproduces_the_papers_beta_at_every_change(dataset: str) -> None:
+    schedule = _schedule(hyperparams.load_row("dce", dataset))
+    values = [schedule.value(epoch * 1000) for epoch in range(0, 1001, 50)]
+    assert values == pytest.approx(BETAS[dataset], abs=1e-6)
+
+
+def test_beta_holds_for_the_whole_interval_of_50_epochs() -> None:
+    schedule = _schedule(hyperparams.load_row("dce", "hopper-medium-replay-v2"))
+    assert schedule.value(49_999) == 4.0
+    assert schedule.value(50_000) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "row_of"),
+    [
+        ("walker2d-medium", "walker2d-medium-v2"),
+        ("pen-human-v1", "pen-human-v0"),
+        ("hopper-medium-expert-sb3", "hopper-medium-expert-v2"),
+        ("door-human-replayed-sb3", "door-human-v0"),
+    ],
+)
+def test_dataset_without_a_row_uses_the_row_it_stands_for(name: str, row_of: str) -> None:
+    row, source = hyperparams.load_row("dce", name), hyperparams.load_row("dce", row_of)
+    assert row.pop("dataset") == catalog.resolve(name).id
+    assert source.pop("dataset") == row_of
+    assert row == source
+
+
+def test_rows_belong_to_the_caller() -> None:
+    hyperparams.load_row("dce", "pen-human-v0")["policy_kwargs"]["net_arch"].append(1)
+    assert hyperparams.load_row("dce", "pen-human-v0")["policy_kwargs"] == {"net_arch": [256, 256]}
+
+
+def test_unknown_algorithm_names_the_known_ones() -> None:
+    with pytest.raises(ConfigError, match=r"'dcee'.*Did you mean 'dce'"):
+        hyperparams.load_row("dcee", "pen-human-v0")
+
+
+def test_algorithm_name_is_not_a_path() -> None:
+    with pytest.raises(ConfigError):
+        hyperparams.load_row("../zoo_hyperparams/dce", "pen-human-v0")
+
+
+def test_unknown_dataset_is_refused() -> None:
+    with pytest.raises(DatasetError, match="halfcheetah-medum"):
+        hyperparams.load_row("dce", "halfcheetah-medum")
+
+
+def test_unknown_key_names_key_closest_parameter_and_file() -> None:
+    with pytest.raises(ConfigError, match=r"my\.yml: OfflineDCE has no parameter 'expectil'\. Did you mean 'expectile'\?"):
+        hyperparams.check_keys(ALGORITHMS["dce"], {"gamma": 0.9, "expectil": 0.7}, where="my.yml")
+
+
+def test_row_without_n_timesteps_is_refused() -> None:
+    with pytest.raises(ConfigError, match="n_timesteps"):
+        hyperparams.split_row({"policy": "MlpPolicy"})
+
+
+def test_keys_of_the_zoo_are_kept_apart() -> None:
+    split = hyperparams.split_row({"n_timesteps": 1e3, "beta": 2.0, "normalize": True})
+    assert split == ({"beta": 2.0}, 1000, {"normalize": True})
