@@ -72,7 +72,7 @@ class AttachingMixin(OffPolicyAlgorithm):
         arguments["policy"] = policy or arguments.get("policy", "MlpPolicy")
         if env is None and spec is not None:
             env = make_env_if_possible(spec.id)
-        return cls(env=env, **arguments)
+        return cls(env=env, **arguments)  # type: ignore[arg-type]
 
     def set_dataset(self, dataset: DatasetLike) -> None:
         """
@@ -128,7 +128,9 @@ class AttachingMixin(OffPolicyAlgorithm):
                 )
             options: dict[str, Any] = {}
             if hasattr(self, "action_space"):  # not yet while the spaces themselves are read from the data
-                options = {"action_low": self.action_space.low.reshape(-1), "action_high": self.action_space.high.reshape(-1)}
+                space = self.action_space
+                assert isinstance(space, spaces.Box)
+                options = {"action_low": space.low.reshape(-1), "action_high": space.high.reshape(-1)}
             self._transitions = load_transitions(self.dataset, d4rl_compat=self.d4rl_compat, **options)
         return self._transitions
 

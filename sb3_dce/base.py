@@ -292,9 +292,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
             metrics = None if self._engine is None else self._engine.metrics
             storages = self.make_storages()
             planned = max(getattr(self, "_total_timesteps", 0) - self.num_timesteps, gradient_steps)
-            self._engine = Engine(
-                self.make_update(storages), TrainState(storages), choose_execution(self.execution, planned)
-            )
+            self._engine = Engine(self.make_update(storages), TrainState(storages), choose_execution(self.execution, planned))
             self._engine.metrics = metrics or self._engine.metrics
         return self._engine
 
@@ -383,7 +381,8 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         """
         # Names that Stable-Baselines3's callbacks look for among the locals of a rollout.
         assert self.env is not None
-        new_obs, infos = self._last_obs, [{}] * self.env.num_envs
+        new_obs = self._last_obs
+        infos: list[dict[str, Any]] = [{}] * self.env.num_envs
         rewards, dones = np.zeros(self.env.num_envs), np.zeros(self.env.num_envs, dtype=bool)
         keep_going = True
         for _ in range(n_steps):

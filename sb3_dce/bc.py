@@ -93,7 +93,7 @@ class OfflineBC(OfflineAlgorithm):
         return [*modules, "actor.optimizer"], tensors
 
     def make_storages(self) -> dict[str, Storage]:
-        return {"actor": Storage(list(self.actor.parameters()), self.actor.optimizer)}
+        return {"actor": Storage.of(self.actor)}
 
     def make_update(self, storages: dict[str, Storage]) -> Update:
         net, settings = PureNet(self.actor, "get_action_dist_params"), storages["actor"].settings
@@ -136,9 +136,7 @@ def update(
             return losses.bc_nll(mean, log_std, batch.actions), (mean, log_std)
         return losses.bc_mse(th.tanh(mean), batch.actions), (mean, log_std)
 
-    actor, value, (mean, log_std), norm = descend(
-        loss, state["actor"], coef["learning_rate"], settings, max_grad_norm
-    )
+    actor, value, (mean, log_std), norm = descend(loss, state["actor"], coef["learning_rate"], settings, max_grad_norm)
     metrics = {"bc_loss": value, "actor_loss": value, "grad_norm_actor": norm}
     metrics["action_dist"] = (th.tanh(mean) - batch.actions).abs().mean()
     metrics["log_std"] = log_std.mean()

@@ -56,7 +56,14 @@ class OfflineReplayBuffer(ReplayBuffer):
         self.buffer_size = max(int(buffer_size), 1)
         self.observation_space = observation_space
         self.action_space = action_space
-        self.obs_shape = get_obs_shape(observation_space)  # type: ignore[assignment]
+        obs_shape = get_obs_shape(observation_space)
+        if not isinstance(obs_shape, tuple):
+            raise ConfigError(
+                f"observations of type {type(observation_space).__name__} are not supported",
+                key="observation_space",
+                hint="Flatten them into one vector first.",
+            )
+        self.obs_shape = obs_shape
         self.action_dim = get_action_dim(action_space)
         self.n_envs = n_envs
         self.optimize_memory_usage = optimize_memory_usage
@@ -71,7 +78,7 @@ class OfflineReplayBuffer(ReplayBuffer):
     # -- storage -------------------------------------------------------------------------------------------------
 
     @property
-    def device(self) -> th.device:  # type: ignore[override]
+    def device(self) -> th.device:
         """
         :return: device of the rows; assigning moves them
         """
@@ -115,9 +122,13 @@ class OfflineReplayBuffer(ReplayBuffer):
             chunk.copy_(2.0 * (chunk - low) / (high - low) - 1.0)
         return rows
 
-    def _allocate(self) -> th.Tensor:
-        self.rows = th.zeros((self.buffer_size, 2 * self.obs_dim + self.action_dim + 2), device=self._device)
-        self._timeouts = np.zeros(self.buffer_size, dtype=bool)
+    def _own_rows(self) -> th.Tensor:
+        """Rows that may be written: allocated now, or a copy of those of the attached (immutable) dataset."""
+        if self.rows is None:
+            self.rows = th.zeros((self.buffer_size, 2 * self.obs_dim + self.action_dim + 2), device=self._device)
+            self._timeouts = np.zeros(self.buffer_size, dtype=bool)
+        elif self._timeouts is not None and not self._timeouts.flags.writeable:
+            self.rows, self._timeouts = self.rows.clone(), self._timeouts.copy()
         return self.rows
 
     def reset(self) -> None:
@@ -146,10 +157,8 @@ class OfflineReplayBuffer(ReplayBuffer):
         :param done: shape (1,); an end by time limit is recognised by ``infos``
         :param infos: one dict, ``TimeLimit.truncated`` marks a time limit
         """
-        rows = self._allocate() if self.rows is None else self.rows
+        rows = self._own_rows()
         assert self._timeouts is not None
-        if not self._timeouts.flags.writeable:  # the attached dataset's own array
-            self._timeouts = self._timeouts.copy()
         timeout = bool(infos[0].get("TimeLimit.truncated", False))
         parts = (obs, action, reward, np.asarray(done) & (not timeout), next_obs)
         row = np.concatenate([np.asarray(part, dtype=np.float32).reshape(-1) for part in parts])

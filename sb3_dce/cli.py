@@ -45,12 +45,14 @@ def demo(
 def train(
     dataset: DatasetArgument,
     algo: Annotated[str, typer.Option(help="Agent: dce, offline_bc.")] = "dce",
-    updates: Annotated[float, typer.Option(help="Gradient steps, e.g. 1e6; default: the dataset's row.")] = 0,
+    updates: Annotated[
+        float, typer.Option(min=0, show_default=False, help="Gradient steps, e.g. 1e6; default: the dataset's row.")
+    ] = 0,
     seeds: Annotated[int, typer.Option(min=1, help="Number of seeds, each a run of its own.")] = 1,
     first_seed: Annotated[int, typer.Option(min=0, help="The first of them.")] = 0,
     eval_freq: Annotated[int, typer.Option(min=1, help="Gradient steps between two evaluations and checkpoints.")] = 5000,
     eval_episodes: Annotated[int, typer.Option(min=1, help="Episodes of each evaluation.")] = 10,
-    workers: Annotated[int, typer.Option(min=0, help="Processes; 0 is one per core.")] = 0,
+    workers: Annotated[int, typer.Option(min=0, show_default=False, help="Processes; default: one per core.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Folder of the results; default runs/<algo>-<dataset>.")] = None,
     set_: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Hyperparameter that replaces the row's; repeat it.")
@@ -100,8 +102,8 @@ def list_datasets(
 
     here = {spec.id: path for spec, path in available()}
     table = Table(box=None, header_style="bold")
-    for title in ("id", "environment", "observations", "actions", "where"):
-        table.add_column(title)
+    for title in ("id", "environment", "obs", "act", "where"):
+        table.add_column(title, no_wrap=title == "id", overflow="fold")
     for spec in all_specs():
         if spec.id in here or all_:
             where = "comes with the package" if spec.embedded else str(here.get(spec.id, "not on this machine"))
@@ -142,8 +144,7 @@ def _parse_overrides(pairs: list[str]) -> dict[str, Any]:
 
 def main() -> None:
     """Entry point: errors of this package are one message on stderr and exit code 2, never a traceback."""
-    # One thread per process unless the user says otherwise: runs are parallel by process.
-    warnings.showwarning = _show_warning
+    warnings.showwarning = _show_warning  # type: ignore[assignment]
     try:
         app()
     except SB3DCEError as error:

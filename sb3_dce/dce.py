@@ -259,22 +259,20 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
     # -- what the base class needs ---------------------------------------------------------------------------------
 
     def make_storages(self) -> dict[str, Storage]:
-        storages = {
-            "actor": Storage(list(self.actor.parameters()), self.actor.optimizer),
-            "critic": Storage(list(self.critic.parameters()), self.critic.optimizer),
-            "critic_target": Storage(list(self.critic_target.parameters())),
+        modules = {
+            "actor": self.actor,
+            "critic": self.critic,
+            "critic_target": self.critic_target,
+            "value_net": self.value_net,
+            "value_net_target": self.policy.value_net_target,
         }
-        if self.value_net is not None:
-            storages["value_net"] = Storage(list(self.value_net.parameters()), self.value_net.optimizer)
-        if self.policy.value_net_target is not None:
-            storages["value_net_target"] = Storage(list(self.policy.value_net_target.parameters()))
+        storages = {name: Storage.of(module) for name, module in modules.items() if module is not None}
         return {**storages, **self.ent_coef_storages()}
 
     def make_update(self, storages: dict[str, Storage]) -> Update:
         nets = {
             "actor": PureNet(self.actor, "get_action_dist_params"),
             "critic": PureNet(self.critic),
-            # The targets use the online critics' functions on their own parameters; only buffers would differ.
             "critic_target": PureNet(self.critic_target),
         }
         if self.value_net is not None:
@@ -315,7 +313,7 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
         if not self.use_v:
             specs["next_actor"] = NoiseSpec("normal", (batch_size, action_dim))
         n_critics, n_layers = self._n_masks()
-        widths = self.policy.critic_kwargs["net_arch"]
+        widths = self.policy.critic_arch
         for i in range(n_critics):
             for j in range(n_layers):
                 rows = (1 + self.n_penalty_actions) * batch_size
@@ -334,7 +332,7 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
     def _n_masks(self) -> tuple[int, int]:
         if self.critic_dropout == 0:
             return (0, 0)
-        return (self.critic.n_critics, len(self.policy.critic_kwargs["net_arch"]))
+        return (self.critic.n_critics, len(self.policy.critic_arch))
 
     def coefficients(self, n_updates: int) -> dict[str, float]:
         beta = self._beta_schedule().value(n_updates)
@@ -450,7 +448,8 @@ def update(
     ent_coef = state[ENT_COEF].params.exp() if options.learned_ent_coef else coef["ent_coef"]
 
     def pi_loss(params: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        actions, log_prob = losses.squashed_gaussian(*nets["actor"](params, s)[:2], noise["actor"])
+        mean, log_std, _ = nets["actor"](params, s)
+        actions, log_prob = losses.squashed_gaussian(mean, log_std, noise["actor"])
         q_pi = losses.reduce_critics(nets["critic"](new["critic"].params, s, actions), options.actor_q)
         return losses.sac_actor_loss(log_prob, q_pi, ent_coef), log_prob
 
@@ -505,7 +504,8 @@ def _next_values(
     """Value of the next state in the TD target, shape (batch, 1)."""
     s2 = batch.next_observations
     if not options.use_v:
-        a2, _ = losses.squashed_gaussian(*nets["actor"](state["actor"].params, s2)[:2], noise["next_actor"])
+        mean, log_std, _ = nets["actor"](state["actor"].params, s2)
+        a2, _ = losses.squashed_gaussian(mean, log_std, noise["next_actor"])
         return losses.reduce_critics(nets["critic_target"](state["critic_target"], s2, a2), "min")
     if options.use_target_v:
         return nets["value_net"](state["value_net_target"], s2)

@@ -27,12 +27,17 @@ from sb3_dce.robotics import KITCHEN_ROBOT_NOISE_RATIO, KitchenObservation, fix_
 
 # the release of Gymnasium all scores were made with
 _GYMNASIUM_WITH_V4 = "1.4.0"
+_MUJOCO = ("mujoco", "imageio")
 _PACKAGES = {
-    "gym": ("mujoco",),
-    "adroit": ("mujoco", "gymnasium_robotics"),
-    "kitchen": ("mujoco", "gymnasium_robotics"),
+    "gym": _MUJOCO,
+    "adroit": (*_MUJOCO, "gymnasium_robotics"),
+    "kitchen": (*_MUJOCO, "gymnasium_robotics"),
 }
-INSTALL_COMMANDS = {"mujoco": "pip install mujoco", "gymnasium_robotics": 'pip install "sb3_dce[robotics]"'}
+INSTALL_COMMANDS = {
+    "mujoco": 'pip install "gymnasium[mujoco]"',
+    "imageio": 'pip install "gymnasium[mujoco]"',
+    "gymnasium_robotics": 'pip install "sb3_dce[robotics]"',
+}
 
 
 class SpacesEnv(gym.Env):

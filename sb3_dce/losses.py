@@ -53,9 +53,7 @@ def value_loss(target_q_values: th.Tensor, values: th.Tensor, expectile: float |
     return expectile_loss(target_q_values - values, expectile)
 
 
-def td_target(
-    rewards: th.Tensor, dones: th.Tensor, next_values: th.Tensor, gamma: float | th.Tensor
-) -> th.Tensor:
+def td_target(rewards: th.Tensor, dones: th.Tensor, next_values: th.Tensor, gamma: float | th.Tensor) -> th.Tensor:
     """
     One-step target ``r + gamma * (1 - d) * V(s')`` (right-hand side of Eq. 5).
 
@@ -68,9 +66,7 @@ def td_target(
     return rewards + gamma * (1.0 - dones) * next_values
 
 
-def critic_loss(
-    q_values: Sequence[th.Tensor], target_q_values: th.Tensor, td_loss_coef: float | th.Tensor
-) -> th.Tensor:
+def critic_loss(q_values: Sequence[th.Tensor], target_q_values: th.Tensor, td_loss_coef: float | th.Tensor) -> th.Tensor:
     """
     Temporal-difference mean square, summed over the critics (first term of Eq. 6).
 

@@ -23,14 +23,14 @@ class KeepDtype:
     which the equality tests need, could not be run. Mixed in before a ``BaseModel``.
     """
 
-    def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor) -> th.Tensor:
+    def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor | None) -> th.Tensor:
         """
         :param obs: shape (batch, *obs_shape)
         :param features_extractor: network applied to the observations
         :return: features, shape (batch, features_dim)
         """
         if isinstance(self.observation_space, spaces.Box):  # type: ignore[attr-defined]
-            assert isinstance(obs, th.Tensor)
+            assert isinstance(obs, th.Tensor) and features_extractor is not None
             return features_extractor(obs.to(self._dtype()))
         return super().extract_features(obs, features_extractor).to(self._dtype())  # type: ignore[misc]
 

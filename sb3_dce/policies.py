@@ -110,13 +110,19 @@ class OfflineSACPolicy(SACPolicy):
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         return OfflineCritic(**kwargs, layer_norm=self.critic_layer_norm).to(self.device)
 
+    @property
+    def critic_arch(self) -> list[int]:
+        """
+        :return: widths of the critics' hidden layers
+        """
+        return get_actor_critic_arch(self.net_arch)[1]
+
     def make_value_net(self) -> ValueNet:
         """
         :return: a new state-value network with the critics' hidden layers
         """
         kwargs = self._update_features_extractor(self.net_args, None)
-        _, critic_arch = get_actor_critic_arch(self.net_arch)
-        kwargs["net_arch"] = critic_arch
+        kwargs["net_arch"] = self.critic_arch
         return ValueNet(**kwargs).to(self.device)
 
     def set_training_mode(self, mode: bool) -> None:

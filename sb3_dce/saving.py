@@ -66,13 +66,13 @@ class SavingMixin(OffPolicyAlgorithm):
         if isinstance(path, io.IOBase):
             super().save(path, exclude, include)
             return
-        target = pathlib.Path(path)  # type: ignore[arg-type]
+        target = pathlib.Path(path)
         target = target if target.suffix else target.with_suffix(".zip")
         with write_atomically(target) as stream:
             super().save(stream, exclude, include)  # type: ignore[arg-type]
 
     @classmethod
-    def load(  # type: ignore[override]
+    def load(
         cls: type[SelfSaving],
         path: str | pathlib.Path | io.BufferedIOBase,
         env: GymEnv | None = None,

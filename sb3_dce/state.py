@@ -70,6 +70,16 @@ class Storage:
         self.settings = None if optimizer is None else AdamSettings.of(optimizer)
         self._bind()
 
+    @classmethod
+    def of(cls, module: nn.Module) -> Storage:
+        """
+        :param module: network; its ``optimizer`` attribute, if it has one, is taken over
+        :return: storage of all its parameters
+        """
+        optimizer = getattr(module, "optimizer", None)
+        assert optimizer is None or isinstance(optimizer, th.optim.Optimizer)
+        return cls(list(module.parameters()), optimizer)
+
     def _bind(self) -> None:
         self.params = _flatten([p.detach() for p in self._parameters])
         for parameter, view in self._views(self.params):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
+from math import prod
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
@@ -143,7 +144,7 @@ class D4RLFile:
         return {name: HDF5Array(dataset, self.path) for name, dataset in chosen.items()}
 
     def _check_size(self, chosen: Mapping[str, h5py.Dataset]) -> None:
-        declared = {name: dataset.size * dataset.dtype.itemsize for name, dataset in chosen.items() if dataset.shape}
+        declared = {name: _declared_bytes(dataset) for name, dataset in chosen.items() if dataset.shape}
         stored = {name: chosen[name].id.get_storage_size() for name in declared}
         total, total_stored = sum(declared.values()), sum(stored.values())
         if total > self.max_bytes:
@@ -216,6 +217,11 @@ def _walk(root: h5py.Group, path: Path) -> Iterator[str]:
                 groups.append((f"{key}/", item, depth + 1))
             elif isinstance(item, h5py.Dataset):
                 yield key
+
+
+def _declared_bytes(dataset: h5py.Dataset) -> int:
+    """Size of an array, or of one of its chunks, which is unpacked as a whole and may be larger than the array."""
+    return int(max(dataset.size, prod(dataset.chunks or ())) * dataset.dtype.itemsize)
 
 
 def _check_link(link: Any, key: str, path: Path) -> None:
