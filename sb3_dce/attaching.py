@@ -19,6 +19,7 @@ from sb3_dce import hyperparams
 from sb3_dce.buffers import OfflineReplayBuffer
 from sb3_dce.data import Transitions, find_file, load_transitions
 from sb3_dce.data.catalog import DatasetSpec, resolve
+from sb3_dce.data.locate import is_path
 from sb3_dce.envs import SpacesEnv, dataset_spaces, make_env_if_possible
 from sb3_dce.errors import ConfigError, DatasetSemanticsError, DatasetWarning
 from sb3_dce.networks import StandardizedExtractor
@@ -146,12 +147,12 @@ class AttachingMixin(OffPolicyAlgorithm):
             return
         transitions = self._load_transitions()
         self.replay_buffer.attach(transitions)
-        info, returns = transitions.info, transitions.info.episode_returns
+        info = transitions.info
         self.dataset_statistics = {
             "rows": info.rows,
             "reward_mean": float(info.reward_mean),
             "reward_abs_max": float(max(abs(info.reward_min), abs(info.reward_max))),
-            "return_range": float(returns.max() - returns.min()) if len(returns) else 0.0,
+            "return_range": info.return_range,
             "n_terminals": int(info.n_terminals),
         }
         reward_mean = self._reward_factor() * info.reward_mean + self.reward_shift
@@ -190,12 +191,3 @@ class AttachingMixin(OffPolicyAlgorithm):
         for module in self.policy.modules():
             if isinstance(module, StandardizedExtractor):
                 module.set_statistics(mean, std)
-
-
-def is_path(name: str | os.PathLike[str]) -> bool:
-    """
-    :param name: id of the catalogue or path
-    :return: whether it is meant as a path
-    """
-    text = os.fspath(name)
-    return not isinstance(name, str) or os.sep in text or text.endswith((".hdf5", ".h5")) or Path(text).is_file()

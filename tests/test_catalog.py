@@ -65,7 +65,7 @@ def test_aliases_complete_the_version(name: str, dataset_id: str) -> None:
 
 
 def test_unknown_name_lists_close_matches() -> None:
-    with pytest.raises(DatasetError, match="walker2d-medium-v2.*all_specs"):
+    with pytest.raises(DatasetError, match=r"walker2d-medium-v2.*all_specs"):
         resolve("waker2d-medium-v2")
 
 
@@ -135,13 +135,11 @@ def test_path_wins_over_name(empty_machine: Path) -> None:
 
 
 def test_missing_path_is_reported() -> None:
-    with pytest.raises(DatasetNotFoundError, match="nowhere.hdf5: no such file"):
+    with pytest.raises(DatasetNotFoundError, match=r"nowhere\.hdf5: no such file"):
         find_file("nowhere.hdf5")
 
 
-def test_missing_official_file_is_never_replaced_by_a_stand_in(
-    empty_machine: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_official_file_is_never_replaced_by_a_stand_in(empty_machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = empty_machine / "mine"
     monkeypatch.setenv("SB3_DCE_DATASETS", str(folder))
     touch(folder / "walker2d-medium-sb3.hdf5")

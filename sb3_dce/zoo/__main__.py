@@ -20,6 +20,7 @@ import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_dce import envs, hyperparams
+from sb3_dce.agents import AGENTS
 from sb3_dce.data import catalog, locate
 from sb3_dce.errors import ConfigError, SB3DCEError
 from sb3_dce.zoo import registry
@@ -71,7 +72,7 @@ def launch(argv: list[str]) -> None:
         if script in _SCRIPTS_WITH_ALGO and not {"-h", "--help"} & set(arguments):
             options = _parse(arguments)
             _check_names(options, algorithms)
-            if script == "train" and options.algo in registry.ALGORITHMS:
+            if script == "train" and options.algo in AGENTS:
                 arguments += _prepare_training(options, arguments, cleanup)
         sys.argv = [f"sb3_dce.zoo.{script}", *arguments]
         try:
@@ -104,7 +105,7 @@ def _check_names(options: argparse.Namespace, algorithms: dict[str, type[BaseAlg
 def _prepare_training(options: argparse.Namespace, arguments: list[str], cleanup: ExitStack) -> list[str]:
     """Check what would fail in the middle of a run; return the configuration argument, if none was given."""
     overrides = [item.split(":")[0] for item in options.hyperparams]
-    hyperparams.check_keys(registry.ALGORITHMS[options.algo], overrides, where="--hyperparams")
+    hyperparams.check_keys(AGENTS[options.algo], overrides, where="--hyperparams")
     # argparse accepts abbreviations: -c, -conf, --conf, --conf-file
     configured = any(argument.startswith(("-c", "--c")) for argument in arguments)
     is_dataset = options.env in {spec.id for spec in catalog.all_specs()}

@@ -1,4 +1,4 @@
-"""Names of the algorithms in rl_zoo3, and the spaces in which its hyperparameter search looks."""
+"""The agents as algorithms of rl_zoo3, and the spaces in which its hyperparameter search looks."""
 
 from __future__ import annotations
 
@@ -7,14 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_dce.dce import OfflineDCE
+from sb3_dce.agents import AGENTS
 
 if TYPE_CHECKING:
     import optuna
-
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {
-    "dce": OfflineDCE,
-}
 
 
 def sample_dce_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
@@ -31,10 +27,9 @@ def sample_dce_params(trial: optuna.Trial, n_actions: int, n_envs: int, addition
     """
     return convert_dce_params(
         {
+            **_sample_optimizer(trial),
             "beta": trial.suggest_float("beta", 0.03, 30.0, log=True),
             "expectile": trial.suggest_float("expectile", 0.5, 0.95),
-            "learning_rate": trial.suggest_float("learning_rate", 1e-4, 1e-3, log=True),
-            "batch_size_pow": trial.suggest_int("batch_size_pow", 6, 10),
             "one_minus_gamma": trial.suggest_float("one_minus_gamma", 1e-3, 3e-2, log=True),
             "tau": trial.suggest_float("tau", 1e-3, 2e-2, log=True),
         }
@@ -46,17 +41,48 @@ def convert_dce_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     :param sampled_params: parameters of a trial, as drawn by :func:`sample_dce_params`
     :return: constructor keywords; a schedule in the row is switched off, since it belongs to another start value
     """
-    params = dict(sampled_params)
+    params = convert_bc_params(sampled_params)
     params["gamma"] = 1.0 - params.pop("one_minus_gamma")
-    params["batch_size"] = 2 ** params.pop("batch_size_pow")
     return {**params, "beta_final": None, "beta_rate": 0.0}
+
+
+def sample_bc_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    Draw hyperparameters of behavioural cloning; see :func:`sample_dce_params`.
+
+    :param trial: trial of the search
+    :param n_actions: unused
+    :param n_envs: unused
+    :param additional_args: unused
+    :return: constructor keywords
+    """
+    return convert_bc_params(_sample_optimizer(trial))
+
+
+def convert_bc_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param sampled_params: parameters of a trial, as drawn by :func:`sample_bc_params`
+    :return: constructor keywords
+    """
+    params = dict(sampled_params)
+    params["batch_size"] = 2 ** params.pop("batch_size_pow")
+    return params
+
+
+def _sample_optimizer(trial: optuna.Trial) -> dict[str, Any]:
+    return {
+        "learning_rate": trial.suggest_float("learning_rate", 1e-4, 1e-3, log=True),
+        "batch_size_pow": trial.suggest_int("batch_size_pow", 6, 10),
+    }
 
 
 SAMPLERS: dict[str, Callable[..., dict[str, Any]]] = {
     "dce": sample_dce_params,
+    "offline_bc": sample_bc_params,
 }
 CONVERTERS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "dce": convert_dce_params,
+    "offline_bc": convert_bc_params,
 }
 
 
@@ -70,7 +96,7 @@ def register() -> dict[str, type[BaseAlgorithm]]:
     from rl_zoo3 import ALGOS
     from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
-    ALGOS.update(ALGORITHMS)
+    ALGOS.update(AGENTS)
     HYPERPARAMS_SAMPLER.update(SAMPLERS)
     HYPERPARAMS_CONVERTER.update(CONVERTERS)
     return ALGOS
