@@ -111,7 +111,7 @@ def test_spaces_env_observation_lies_in_a_space_without_zero() -> None:
 
 def test_without_simulator_making_fails_with_the_command_and_spaces_remain(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(ConfigError, match="pip install mujoco"):
+    with pytest.raises(ConfigError, match=r'pip install "gymnasium\[mujoco\]"'):
         gym.make("halfcheetah-medium-v2")
     assert isinstance(envs.make_env_if_possible("halfcheetah-medium-v2"), envs.SpacesEnv)
 

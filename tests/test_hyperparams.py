@@ -11,10 +11,10 @@ import gymnasium as gym
 import pytest
 
 from sb3_dce import hyperparams
+from sb3_dce.agents import AGENTS
 from sb3_dce.data import catalog
 from sb3_dce.errors import ConfigError, DatasetError
 from sb3_dce.schedules import StepSchedule
-from sb3_dce.zoo.registry import ALGORITHMS
 
 DATA = Path(__file__).parent / "data"
 
@@ -28,7 +28,7 @@ PAPER = _table("paper_config.csv")
 BETAS = {
     row["dataset"]: [float(value) for key, value in row.items() if key != "dataset"] for row in _table("beta_schedules.csv")
 }
-ROWS = [(algo, name, row) for algo in ALGORITHMS for name, row in hyperparams.read_rows(algo).items()]
+ROWS = [(algo, name, row) for algo in AGENTS for name, row in hyperparams.read_rows(algo).items()]
 all_rows = pytest.mark.parametrize(("algo", "name", "row"), ROWS, ids=[f"{algo}-{name}" for algo, name, _ in ROWS])
 
 
@@ -54,9 +54,9 @@ def test_numbers_are_not_read_as_text(algo: str, name: str, row: dict[str, Any])
 
 @all_rows
 def test_keys_are_constructor_parameters_or_known_to_the_zoo(algo: str, name: str, row: dict[str, Any]) -> None:
-    parameters = inspect.signature(ALGORITHMS[algo]).parameters
+    parameters = inspect.signature(AGENTS[algo]).parameters
     assert set(row) <= {*parameters, *hyperparams.ZOO_KEYS}
-    hyperparams.check_keys(ALGORITHMS[algo], row)
+    hyperparams.check_keys(AGENTS[algo], row)
 
 
 @all_rows
@@ -71,7 +71,7 @@ def test_row_name_is_its_dataset_a_catalogue_id_and_an_environment(algo: str, na
 @all_rows
 def test_row_builds_a_model_that_survives_saving(algo: str, name: str, row: dict[str, Any], tmp_path: Path) -> None:
     arguments, _, _ = hyperparams.split_row({"dataset": "hopper-medium-v2", **row})
-    cls = ALGORITHMS[algo]
+    cls = AGENTS[algo]
     cls(**arguments, device="cpu").save(tmp_path / "model")
     loaded = cls.load(tmp_path / "model", device="cpu")
     for key, value in arguments.items():
@@ -148,7 +148,7 @@ def test_unknown_dataset_is_refused() -> None:
 
 def test_unknown_key_names_key_closest_parameter_and_file() -> None:
     with pytest.raises(ConfigError, match=r"my\.yml: OfflineDCE has no parameter 'expectil'\. Did you mean 'expectile'\?"):
-        hyperparams.check_keys(ALGORITHMS["dce"], {"gamma": 0.9, "expectil": 0.7}, where="my.yml")
+        hyperparams.check_keys(AGENTS["dce"], {"gamma": 0.9, "expectil": 0.7}, where="my.yml")
 
 
 def test_row_without_n_timesteps_is_refused() -> None:

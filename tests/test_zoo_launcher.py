@@ -13,7 +13,8 @@ import pytest
 import yaml
 
 from sb3_dce import OfflineDCE, hyperparams
-from sb3_dce.zoo.registry import ALGORITHMS, CONVERTERS, SAMPLERS
+from sb3_dce.agents import AGENTS
+from sb3_dce.zoo.registry import CONVERTERS, SAMPLERS
 
 DATASET = "halfcheetah-tiny-sb3"
 RUN = f"logs/dce/{DATASET}_1"
@@ -68,7 +69,7 @@ REFUSALS = {
     ),
     "unknown hyperparameter": Refusal([*TRAIN, "-params", "expectil:0.8"], "", "Did you mean 'expectile'?"),
     "evaluation without simulator": Refusal(
-        TRAIN, "mujoco", "pip install mujoco - or train without evaluation: --eval-freq -1"
+        TRAIN, "mujoco", 'pip install "gymnasium[mujoco]" - or train without evaluation: --eval-freq -1'
     ),
     "search without simulator": Refusal([*TRAIN, "-optimize", *NO_EVALUATION], "mujoco", "the package 'mujoco' is missing"),
     "dataset file missing": Refusal(
@@ -189,9 +190,10 @@ def test_algorithms_of_the_zoo_stay_and_ours_are_added(tmp_path: Path) -> None:
     code = """
 import rl_zoo3
 before = dict(rl_zoo3.ALGOS)
+from sb3_dce.agents import AGENTS
 from sb3_dce.zoo import registry
-assert not set(before) & set(registry.ALGORITHMS)
-assert registry.register() is rl_zoo3.ALGOS == {**before, **registry.ALGORITHMS}
+assert not set(before) & set(AGENTS)
+assert registry.register() is rl_zoo3.ALGOS == {**before, **AGENTS}
 from rl_zoo3 import exp_manager
 assert exp_manager.ALGOS is rl_zoo3.ALGOS
 assert {"sac", "dce"} <= set(exp_manager.HYPERPARAMS_SAMPLER) & set(exp_manager.HYPERPARAMS_CONVERTER)
@@ -205,14 +207,14 @@ def test_importing_the_package_does_not_import_the_zoo(tmp_path: Path) -> None:
 
 
 def test_every_algorithm_can_be_searched() -> None:
-    assert set(SAMPLERS) == set(CONVERTERS) == set(ALGORITHMS)
+    assert set(SAMPLERS) == set(CONVERTERS) == set(AGENTS)
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
+@pytest.mark.parametrize("algo", AGENTS)
 def test_sampled_values_build_a_model_from_every_row(algo: str) -> None:
     optuna = pytest.importorskip("optuna")
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
-    cls = ALGORITHMS[algo]
+    cls = AGENTS[algo]
     for row in hyperparams.read_rows(algo).values():
         trial = study.ask()
         sampled = SAMPLERS[algo](trial, 6, 1, {})
