@@ -11,6 +11,7 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import torch as th
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -36,11 +37,10 @@ def launch(specs: Sequence[RunSpec], workers: int, console: Console) -> list[dic
     workers = max(1, min(workers, len(specs)))
     threads = max(1, (os.cpu_count() or 1) // workers)
     context = mp.get_context("spawn")
-    with context.Manager() as manager, _display(console) as display:
-        events = manager.Queue()
-        # A pool of processes that end with their work: each run frees its memory.
-        with ProcessPoolExecutor(workers, mp_context=context, initializer=_prepare, initargs=(threads,)) as pool:
-            futures = [pool.submit(_run, spec, events) for spec in specs]
+    events = context.Queue()
+    with _display(console) as display:
+        with ProcessPoolExecutor(workers, mp_context=context, initializer=_prepare, initargs=(threads, events)) as pool:
+            futures = [pool.submit(_run, spec) for spec in specs]
             try:
                 _show_until_done(futures, events, specs, display)
                 return [future.result() for future in futures]
@@ -93,15 +93,19 @@ def _show_until_done(futures: list[Future[Any]], events: Any, specs: Sequence[Ru
             )
 
 
-def _prepare(threads: int) -> None:
-    import torch as th
+# Where a worker process reports to; set when it starts, since a queue cannot be sent with each task.
+_events: Any = None
 
+
+def _prepare(threads: int, events: Any) -> None:
+    global _events
+    _events = events
     th.set_num_threads(threads)
 
 
-def _run(spec: RunSpec, events: Any) -> dict[str, Any]:
+def _run(spec: RunSpec) -> dict[str, Any]:
     try:
-        return runs.run(spec, events.put)
+        return runs.run(spec, _events.put)
     except SB3DCEError:
         raise
     except Exception as error:

@@ -43,6 +43,9 @@ class PureNet:
         self._names = list(named)
         self._shapes = [parameter.shape for parameter in named.values()]
         self._sizes = [parameter.numel() for parameter in named.values()]
+        owners = dict(self._wrapper.named_modules())
+        places = [name.rpartition(".") for name in self._names]
+        self._slots = [(owners[path]._parameters, key) for path, _, key in places]
 
     def __call__(self, flat: th.Tensor, *args: Any) -> Any:
         """
@@ -52,8 +55,21 @@ class PureNet:
         """
         # One split, not one slice per tensor: the gradient of the split is a single concatenation.
         pieces = flat.split(self._sizes)
-        parameters = {n: p.view(s) for n, p, s in zip(self._names, pieces, self._shapes, strict=True)}
-        return functional_call(self._wrapper, parameters, args)
+        tensors = [piece.view(shape) for piece, shape in zip(pieces, self._shapes, strict=True)]
+        if th.compiler.is_compiling():
+            return functional_call(self._wrapper, dict(zip(self._names, tensors, strict=True)), args)
+        return self._call_with(tensors, args)
+
+    def _call_with(self, tensors: list[th.Tensor], args: tuple[Any, ...]) -> Any:
+        """What ``functional_call`` does, without its search for names: that search takes longer than a small network."""
+        originals = [parameters[key] for parameters, key in self._slots]
+        try:
+            for (parameters, key), tensor in zip(self._slots, tensors, strict=True):
+                parameters[key] = tensor  # type: ignore[assignment]
+            return self._wrapper(*args)
+        finally:
+            for (parameters, key), original in zip(self._slots, originals, strict=True):
+                parameters[key] = original
 
 
 class Storage:

@@ -28,12 +28,31 @@ def descend(
     :param max_grad_norm: clip the gradient to this Euclidean norm; ``None`` leaves it alone
     :return: learner after the step, loss, what else ``loss`` returned, norm of the gradient before clipping
     """
-    gradient, (value, kept) = grad_and_value(loss, has_aux=True)(learner.params)
+    gradient, value, kept = _gradient(loss, learner.params)
     norm = th.linalg.vector_norm(gradient)
     if max_grad_norm is not None:
         # The small constant is that of torch.nn.utils.clip_grad_norm_.
         gradient = gradient * th.clamp(max_grad_norm / (norm + 1e-6), max=1.0)
     return adam_step(learner, gradient, learning_rate, settings), value, kept, norm
+
+
+def _gradient(loss: Callable[[th.Tensor], tuple[th.Tensor, Any]], params: th.Tensor) -> tuple[th.Tensor, th.Tensor, Any]:
+    """Gradient, value and the rest of one loss; ordinary autograd computes the same as ``torch.func`` with less overhead."""
+    if th.compiler.is_compiling() or th._C._functorch.is_functorch_wrapped_tensor(params):
+        # Inside a compiled graph or under vmap only the functional form works.
+        gradient, (value, kept) = grad_and_value(loss, has_aux=True)(params)
+        return gradient, value, kept
+    leaf = params.detach().requires_grad_(True)
+    with th.enable_grad():
+        value, kept = loss(leaf)
+        (gradient,) = th.autograd.grad(value, leaf)
+    return gradient, value.detach(), _detached(kept)
+
+
+def _detached(tree: Any) -> Any:
+    if isinstance(tree, th.Tensor):
+        return tree.detach()
+    return type(tree)(map(_detached, tree))
 
 
 def polyak(params: th.Tensor, target_params: th.Tensor, tau: th.Tensor) -> th.Tensor:

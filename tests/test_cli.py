@@ -1,0 +1,216 @@
+"""The command line as a person uses it: what it prints, what it writes, and how it refuses."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import subprocess
+import sys
+import time
+from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import NamedTuple
+
+import h5py
+import numpy as np
+import pytest
+import yaml
+from rich.console import Console
+from stable_baselines3.common.evaluation import evaluate_policy
+from typer.testing import CliRunner
+
+from sb3_dce import OfflineDCE, cli
+from sb3_dce.envs import make_env_if_possible
+from sb3_dce.errors import ConfigError
+
+TINY = "halfcheetah-tiny-sb3"
+FAST = ("--set", "policy_kwargs={net_arch: [16, 16]}", "--set", "execution=eager", "--set", "batch_size=32")
+TRAIN = ("train", TINY, "--updates", "60", "--eval-freq", "30", "--eval-episodes", "2", "--seeds", "2", *FAST)
+
+
+class Outcome(NamedTuple):
+    code: int
+    stdout: str
+    stderr: str
+
+
+def sb3_dce(*arguments: str) -> Outcome:
+    """The entry point in this process, as the installed command calls it."""
+    stdout, stderr = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(stdout), redirect_stderr(stderr):
+        patch.setattr(sys, "argv", ["sb3-dce", *arguments])
+        patch.setattr(cli, "console", Console(highlight=False, width=200))
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+    return Outcome(ended.value.code or 0, stdout.getvalue(), stderr.getvalue())
+
+
+def refused(outcome: Outcome) -> str:
+    """One message on stderr, exit code 2, no traceback."""
+    assert outcome.code == 2, outcome
+    assert "Traceback" not in outcome.stderr + outcome.stdout
+    assert outcome.stderr.startswith("Error: ")
+    return outcome.stderr
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Outcome]:
+    cwd = tmp_path_factory.mktemp("train")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(cwd)
+        return cwd, sb3_dce(*TRAIN)
+
+
+def test_train_shows_evaluations_and_writes_a_run_folder(trained: tuple[Path, Outcome]) -> None:
+    cwd, result = trained
+    assert result.code == 0, result
+    assert "@      30" in result.stdout and "@      60" in result.stdout and "score" in result.stdout
+    folder = cwd / "runs" / f"dce-{TINY}"
+    assert (folder / "learning_curve.png").stat().st_size > 10_000
+    for seed in (0, 1):
+        run = folder / f"seed_{seed}"
+        names = {path.name for path in run.iterdir()}
+        assert names == {
+            "model.zip",
+            "config.yml",
+            "evaluations.npz",
+            "evaluations.csv",
+            "progress_0.csv",
+            "result.json",
+        }
+        config = yaml.safe_load((run / "config.yml").read_text())
+        assert config["hyperparameters"]["beta_final"] == 0.1  # the row of halfcheetah-medium-replay-v2
+        assert len(config["dataset"]["sha256"]) == 64
+        with np.load(run / "evaluations.npz") as data:
+            assert data["timesteps"].tolist() == [30, 60]
+            assert data["results"].shape == (2, 2)
+
+
+def test_only_the_run_folder_is_written(trained: tuple[Path, Outcome]) -> None:
+    cwd, _ = trained
+    assert [path.name for path in cwd.iterdir()] == ["runs"]
+
+
+def test_the_saved_model_evaluates_as_the_run_reported(trained: tuple[Path, Outcome]) -> None:
+    cwd, _ = trained
+    run = cwd / "runs" / f"dce-{TINY}" / "seed_0"
+    result = sb3_dce("evaluate", str(run / "model.zip"), "--episodes", "2")
+    assert result.code == 0 and "normalised score" in result.stdout, result
+    model = OfflineDCE.load(run / "model.zip")
+    returns, _ = evaluate_policy(model, make_env_if_possible(TINY), n_eval_episodes=1, warn=False)
+    assert np.isfinite(returns)
+
+
+def test_the_same_command_does_not_repeat_finished_runs(
+    trained: tuple[Path, Outcome], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cwd, _ = trained
+    model = cwd / "runs" / f"dce-{TINY}" / "seed_0" / "model.zip"
+    before = model.stat().st_mtime_ns
+    monkeypatch.chdir(cwd)
+    assert sb3_dce(*TRAIN).code == 0
+    assert model.stat().st_mtime_ns == before
+
+
+def test_an_interrupted_run_goes_on_and_ends_like_an_uninterrupted_one(tmp_path: Path) -> None:
+    """The first call is killed after its first checkpoint; the second ends with the same weights and evaluations."""
+    arguments = ("train", TINY, "--updates", "60", "--eval-freq", "20", "--eval-episodes", "1", *FAST)
+    command = [sys.executable, "-c", "from sb3_dce.cli import main; main()", *arguments, "--out", "killed"]
+    killed = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, start_new_session=True)
+    checkpoint = tmp_path / "killed" / "seed_0" / "checkpoint.zip"
+    deadline = time.monotonic() + 200
+    while not checkpoint.exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(killed.pid, 9)
+    killed.wait()
+    assert checkpoint.exists() and not (tmp_path / "killed" / "seed_0" / "result.json").exists()
+    for name in ("killed", "whole"):
+        assert sb3_dce(*arguments, "--out", str(tmp_path / name)).code == 0
+    models = [OfflineDCE.load(tmp_path / name / "seed_0" / "model.zip") for name in ("killed", "whole")]
+    assert models[0]._n_updates == models[1]._n_updates == 60
+    for a, b in zip(models[0].policy.parameters(), models[1].policy.parameters(), strict=True):
+        assert (a == b).all()
+    results = [json.loads((tmp_path / name / "seed_0" / "result.json").read_text()) for name in ("killed", "whole")]
+    assert results[0]["returns"] == results[1]["returns"]
+    evaluations = [(tmp_path / name / "seed_0" / "evaluations.csv").read_text() for name in ("killed", "whole")]
+    assert evaluations[0] == evaluations[1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("train", "walker2d-medium"), ("walker2d_medium-v2.hdf5", "Download http", "Available now", "halfcheetah-demo-sb3")),
+        (("train", "walker2d-medum"), ("walker2d-medium",)),
+        (("train", "missing.hdf5"), ("no such file", "missing.hdf5")),
+        (("train", TINY, "--set", "betta=2"), ("'betta'", "Did you mean 'beta'")),
+        (("train", TINY, "--set", "beta"), ("KEY=VALUE",)),
+        (("train", TINY, "--set", "expectile=1.7"), ("expectile must be", "1.7", "0.7")),
+        (("train", TINY, "--algo", "dse"), ("unknown algorithm 'dse'", "dce")),
+        (("evaluate", "missing.zip"), ("no such file",)),
+        (("datasets", "info", "nonsense"), ("nonsense",)),
+    ],
+)
+def test_user_errors_are_one_clear_message(arguments: tuple[str, ...], words: tuple[str, ...]) -> None:
+    message = refused(sb3_dce(*arguments))
+    for word in words:
+        assert word in message
+
+
+def test_bad_files_are_one_clear_message(tmp_path: Path) -> None:
+    (tmp_path / "page.hdf5").write_text("<html>404</html>")
+    assert "not an HDF5 file" in refused(sb3_dce("train", str(tmp_path / "page.hdf5")))
+    arrays = {
+        "observations": np.zeros((20, 17), np.float32),
+        "actions": np.zeros((20, 6), np.float32),
+        "rewards": np.zeros(20, np.float32),
+    }
+    with h5py.File(tmp_path / "incomplete.hdf5", "w") as file:
+        for key, array in arrays.items():
+            file[key] = array
+    assert "terminals" in refused(sb3_dce("datasets", "info", str(tmp_path / "incomplete.hdf5")))
+    arrays["rewards"][3] = np.nan
+    with h5py.File(tmp_path / "nan.hdf5", "w") as file:
+        for key, array in {**arrays, "terminals": np.zeros(20, bool)}.items():
+            file[key] = array
+    message = refused(sb3_dce("train", str(tmp_path / "nan.hdf5"), "--updates", "10", *FAST))
+    assert "rewards" in message and "3" in message and "drop_nonfinite" in message
+    assert "not a zip file" in refused(sb3_dce("evaluate", str(tmp_path / "page.hdf5")))
+
+
+def test_a_refused_run_writes_nothing(tmp_path: Path) -> None:
+    refused(sb3_dce("train", "walker2d-medium", "--out", str(tmp_path / "run")))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_datasets_list_names_the_embedded_data() -> None:
+    result = sb3_dce("datasets", "list", "--all")
+    assert result.code == 0
+    for name in (TINY, "halfcheetah-demo-sb3", "walker2d-medium-v2", "kitchen-mixed-v0"):
+        assert name in result.stdout
+
+
+def test_datasets_info_says_what_is_in_a_file() -> None:
+    result = sb3_dce("datasets", "info", TINY)
+    assert result.code == 0
+    assert "5,000 rows" in result.stdout and "returns min -217.2" in result.stdout and "sha256" in result.stdout
+
+
+@pytest.mark.parametrize("command", [[], ["demo"], ["train"], ["evaluate"], ["datasets"], ["datasets", "info"]])
+def test_help_reads_well(command: list[str]) -> None:
+    result = CliRunner().invoke(cli.app, [*command, "--help"])
+    assert result.exit_code == 0
+    assert "Usage" in result.output
+
+
+def test_overrides_are_read_as_yaml_without_evaluation() -> None:
+    pairs = ["beta=2.0", "learning_rate=3e-4", "use_v=false", "policy_kwargs={net_arch: [8, 8]}", "ent_coef=auto"]
+    assert cli._parse_overrides(pairs) == {
+        "beta": 2.0,
+        "learning_rate": 3e-4,
+        "use_v": False,
+        "policy_kwargs": {"net_arch": [8, 8]},
+        "ent_coef": "auto",
+    }
+    with pytest.raises(ConfigError):
+        cli._parse_overrides(["=3"])
