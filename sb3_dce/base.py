@@ -118,6 +118,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
             sde_support=False,
             supported_action_spaces=(spaces.Box,),
         )
+        self.algo = self.algo_name  # tells whose file a saved model is
         self.normalize_obs = normalize_obs
         self.reward_normalization = reward_normalization
         self.reward_scale = reward_scale

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import io
+import json
 import pathlib
+import zipfile
 from collections.abc import Iterable
-from typing import Any, TypeVar
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar
 
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -28,6 +31,7 @@ EXCLUDED = (
 class SavingMixin(OffPolicyAlgorithm):
     """What :class:`~sb3_dce.base.OfflineAlgorithm` changes about saving and loading."""
 
+    algo_name: ClassVar[str]
     _generator: th.Generator | None
     rng_state: th.Tensor
 
@@ -94,9 +98,20 @@ class SavingMixin(OffPolicyAlgorithm):
         :param kwargs: constructor arguments that replace the saved ones
         :return: model
         :raises ConfigError: for an unknown keyword
-        :raises CheckpointError: if the parameters in the file do not fit the (changed) configuration
+        :raises CheckpointError: if the file is missing, damaged or another agent's, or its parameters do not fit the
+            (changed) configuration
         """
         hyperparams.check_keys(cls, kwargs, where=f"{cls.__name__}.load")
+        if not isinstance(path, io.IOBase):
+            path = existing_zip(Path(path))
+            saved = saved_algo(path)
+            if saved != cls.algo_name:
+                raise CheckpointError(
+                    f"the file holds a model of {saved or 'another package'!r}, not of {cls.algo_name!r} ({cls.__name__})",
+                    where=str(path),
+                    path=path,
+                    hint="Load it with the class it was saved from.",
+                )
         return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
 
     def set_parameters(
@@ -126,6 +141,39 @@ class SavingMixin(OffPolicyAlgorithm):
         :return: state dicts by name; the tensors are copies, independent of further training
         """
         return {name: _cloned(recursive_getattr(self, name).state_dict()) for name in self._get_torch_save_params()[0]}
+
+
+def existing_zip(path: Path) -> Path:
+    """
+    :param path: as given by the user, with or without ".zip"
+    :return: the file that is there
+    :raises CheckpointError: if none is
+    """
+    for candidate in (path, path.with_name(path.name + ".zip")):
+        if candidate.is_file():
+            return candidate
+    raise CheckpointError("no such file", where=str(path), path=path, hint="Give the path of a saved model, a .zip file.")
+
+
+def saved_algo(path: Path) -> str | None:
+    """
+    Which agent a file belongs to; nothing in it is unpickled.
+
+    :param path: zip file
+    :return: name of the agent, ``None`` for a model of another package
+    :raises CheckpointError: if it is no saved model
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            saved = json.loads(archive.read("data"))
+    except (zipfile.BadZipFile, KeyError, ValueError, OSError) as error:
+        raise CheckpointError(
+            f"not a saved model ({error})",
+            where=str(path),
+            path=path,
+            hint="The file is damaged or something else: give a zip file written by model.save().",
+        ) from error
+    return saved.get("algo") if isinstance(saved, dict) else None
 
 
 def _cloned(tree: Any) -> Any:

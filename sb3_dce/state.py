@@ -65,7 +65,7 @@ class PureNet:
         originals = [parameters[key] for parameters, key in self._slots]
         try:
             for (parameters, key), tensor in zip(self._slots, tensors, strict=True):
-                parameters[key] = tensor  # type: ignore[assignment]
+                parameters[key] = tensor
             return self._wrapper(*args)
         finally:
             for (parameters, key), original in zip(self._slots, originals, strict=True):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from sb3_dce import hyperparams
-from sb3_dce.agents import AGENTS, agent_class
+from sb3_dce.agents import agent_class
+from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.data import find_file
 from sb3_dce.data.catalog import resolve
 from sb3_dce.errors import CheckpointError, ConfigError
@@ -20,6 +20,7 @@ from sb3_dce.evaluation import Evaluation, catalogue_id, evaluate, make_eval_env
 from sb3_dce.launch import launch
 from sb3_dce.plots import plot_learning_curves
 from sb3_dce.runs import RunSpec
+from sb3_dce.saving import existing_zip, saved_algo
 
 
 def train_seeds(
@@ -121,7 +122,7 @@ def evaluate_file(model_path: Path, dataset: str | None, n_episodes: int, seed: 
     return evaluate(model, env, n_episodes, seed, dataset_id)
 
 
-def load_any(path: Path) -> Any:
+def load_any(path: Path) -> OfflineAlgorithm:
     """
     Load a model of whichever agent it is.
 
@@ -129,20 +130,10 @@ def load_any(path: Path) -> Any:
     :return: model
     :raises CheckpointError: if the file is not there, damaged, or no model of this package
     """
-    if not path.is_file():
-        raise CheckpointError("no such file", where=str(path), path=path, hint="Give the path of a model.zip.")
-    for agent in AGENTS.values():
-        try:
-            return agent.load(path)
-        except zipfile.BadZipFile as error:
-            raise CheckpointError(
-                f"not a zip file ({error})", where=str(path), path=path, hint="Give a model saved by this package."
-            ) from error
-        except (CheckpointError, ConfigError, ValueError, KeyError, TypeError, AssertionError, RuntimeError):
-            continue
-    raise CheckpointError(
-        f"no agent of this package can load it; known are {', '.join(AGENTS)}",
-        where=str(path),
-        path=path,
-        hint="Load models of other packages with their own classes.",
-    )
+    path = existing_zip(path)
+    algo = saved_algo(path)
+    if algo is None:
+        raise CheckpointError(
+            "the file is a model of another package", where=str(path), path=path, hint="Load it with its own class."
+        )
+    return agent_class(algo).load(path)

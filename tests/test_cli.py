@@ -175,7 +175,7 @@ def test_bad_files_are_one_clear_message(tmp_path: Path) -> None:
             file[key] = array
     message = refused(sb3_dce("train", str(tmp_path / "nan.hdf5"), "--updates", "10", *FAST))
     assert "rewards" in message and "3" in message and "drop_nonfinite" in message
-    assert "not a zip file" in refused(sb3_dce("evaluate", str(tmp_path / "page.hdf5")))
+    assert "not a saved model" in refused(sb3_dce("evaluate", str(tmp_path / "page.hdf5")))
 
 
 def test_a_refused_run_writes_nothing(tmp_path: Path) -> None:
