@@ -35,17 +35,13 @@ class Recording(NamedTuple):
     seed: int
 
 
-RECORDINGS = {
-    "halfcheetah-medium-replay-sb3": Recording(
-        "SAC while it learns: the whole replay buffer up to the first evaluation (every 10 000 steps, 5 deterministic "
-        "episodes) at or above 4770, reached with 4857 at 90 000 steps; the first 10 000 steps are random actions. SBX's SAC, "
-        "networks 256-256, batch 256, learning rate 3e-4, 16 updates after every 16 steps, target entropy -6",
-        seed=0,
-    ),
-    "halfcheetah-medium-sb3": Recording(
-        "stochastic episodes of one SAC actor, which stood at 4857 (deterministic) after 90 000 steps of training", seed=1
-    ),
-}
+SOURCE = "halfcheetah-medium-replay-sb3"
+RECORDING = Recording(
+    "SAC while it learns: the whole replay buffer up to the first evaluation (every 10 000 steps, 5 deterministic "
+    "episodes) at or above 4770, reached with 4857 at 90 000 steps; the first 10 000 steps are random actions. SBX's SAC, "
+    "networks 256-256, batch 256, learning rate 3e-4, 16 updates after every 16 steps, target entropy -6",
+    seed=0,
+)
 
 
 def read_arrays(path: Path) -> Arrays:
@@ -81,21 +77,21 @@ def evenly_spaced(n_episodes: int, n_wanted: int) -> list[int]:
     return np.linspace(0, n_episodes - 1, n_wanted).round().astype(int).tolist()
 
 
-def choose_rows(arrays: Arrays, source: str, n_episodes: int | None) -> tuple[Arrays, str]:
+def choose_rows(arrays: Arrays, source: str, n_episodes: int, spread: bool) -> tuple[Arrays, str]:
     """
-    The rows of a dataset: all of a recording, or some whole episodes.
+    Some whole episodes of a recording.
 
     :param arrays: key to array
     :param source: id of the recording
-    :param n_episodes: whole episodes to take, evenly spaced; None for all rows
+    :param n_episodes: whole episodes to take
+    :param spread: evenly spaced over the run; otherwise the first ones
     :return: key to array, and the choice in words
     """
-    if n_episodes is None:
-        return arrays, f"all rows of {source} in the order of time"
     episodes = whole_episodes(arrays)
-    numbers = evenly_spaced(len(episodes), n_episodes)
+    numbers = evenly_spaced(len(episodes), n_episodes) if spread else list(range(n_episodes))
     chosen = {key: np.concatenate([array[episodes[number]] for number in numbers]) for key, array in arrays.items()}
-    return chosen, f"{n_episodes} of the {len(episodes)} whole episodes of {source}, evenly spaced over the run"
+    where = "evenly spaced over the run" if spread else "the first ones: the buffer at an earlier moment"
+    return chosen, f"{n_episodes} of the {len(episodes)} whole episodes of {source}, {where}"
 
 
 def describe(dataset_id: str, arrays: Arrays, source: str, choice: str) -> dict[str, Any]:
@@ -114,10 +110,10 @@ def describe(dataset_id: str, arrays: Arrays, source: str, choice: str) -> dict[
         "generated": True,
         "env_id": resolve(dataset_id).env_id,
         "source": source,
-        "behaviour_policy": RECORDINGS[source].behaviour,
+        "behaviour_policy": RECORDING.behaviour,
         "choice_of_rows": choice,
         "licence": "MIT",
-        "seed": RECORDINGS[source].seed,
+        "seed": RECORDING.seed,
         "versions": VERSIONS,
         "rows": len(arrays["rewards"]),
         "episodes": len(returns),
@@ -164,19 +160,19 @@ def data_card(attrs: dict[str, Any], path: Path) -> str:
     )
 
 
-def make_dataset(dataset_id: str, recordings: Path, source: str, n_episodes: int | None, folder: Path) -> None:
+def make_dataset(dataset_id: str, recordings: Path, n_episodes: int, spread: bool, folder: Path) -> None:
     """
     Write a dataset and its data card, and print its hash.
 
     :param dataset_id: id
     :param recordings: folder of the recordings
-    :param source: id of the recording to take it from
-    :param n_episodes: whole episodes to take, None for all rows
+    :param n_episodes: whole episodes to take
+    :param spread: evenly spaced over the run; otherwise the first ones
     :param folder: where to write
     """
     path = folder / f"{dataset_id}.hdf5"
-    arrays, choice = choose_rows(read_arrays(recordings / f"{source}.hdf5"), source, n_episodes)
-    attrs = describe(dataset_id, arrays, source, choice)
+    arrays, choice = choose_rows(read_arrays(recordings / f"{SOURCE}.hdf5"), SOURCE, n_episodes, spread)
+    attrs = describe(dataset_id, arrays, SOURCE, choice)
     write_hdf5(path, arrays, attrs, compression_level=9)
     path.with_suffix(".md").write_text(data_card(attrs, path), encoding="utf-8")
     print(f'    "{dataset_id}": "{file_sha256(path)}",  # {path.stat().st_size:,} bytes')
@@ -187,16 +183,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--replay-dir", type=Path, required=True, help="folder with the recordings")
     parser.add_argument("--out", type=Path, default=embedded_folder(), help="folder to write to")
-    parser.add_argument(
-        "--demo-source", choices=RECORDINGS, default="halfcheetah-medium-replay-sb3", help="default: %(default)s"
-    )
-    parser.add_argument("--demo-episodes", type=int, help="whole episodes of the demo set, default: all rows")
-    parser.add_argument("--tiny-episodes", type=int, default=5, help="whole episodes of the tiny set, default: %(default)s")
+    parser.add_argument("--demo-episodes", type=int, default=60, help="first episodes of the run, default: %(default)s")
+    parser.add_argument("--tiny-episodes", type=int, default=5, help="episodes spread over the run, default: %(default)s")
     args = parser.parse_args()
-
-    tiny_source = "halfcheetah-medium-replay-sb3"
-    make_dataset("halfcheetah-tiny-sb3", args.replay_dir, tiny_source, args.tiny_episodes, args.out)
-    make_dataset("halfcheetah-demo-sb3", args.replay_dir, args.demo_source, args.demo_episodes, args.out)
+    make_dataset("halfcheetah-tiny-sb3", args.replay_dir, args.tiny_episodes, True, args.out)
+    make_dataset("halfcheetah-demo-sb3", args.replay_dir, args.demo_episodes, False, args.out)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ D4RL_URL = "http://rail.eecs.berkeley.edu/datasets/offline_rl/"
 # SHA-256 of the files that come with the package. Generated and official files are never pinned here: the bits of the
 # former depend on the machine, and no hash of the latter has been published.
 _EMBEDDED_SHA256 = {
-    "halfcheetah-demo-sb3": "55349b4c604aaf337c4bf0d240c799f595e151447967ba21bec5b779979c7ac4",
+    "halfcheetah-demo-sb3": "a47d8b88e9d9aba102fa4afdbac33803e9afee7275dd5ced1c13168345048808",
     "halfcheetah-tiny-sb3": "6b7598bdd4d121ac2388a6352c9d04fb40b032718d86349388bfc489436ea6a8",
 }
 

@@ -1,0 +1,891 @@
+"""
+One battery for all agents: what users of Stable-Baselines3 expect of an algorithm, and what offline training adds.
+
+To put another agent under test, add a line to ``AGENTS``.
+"""
+
+from __future__ import annotations
+
+import copy
+import csv
+import errno
+import inspect
+import io
+import os
+import tracemalloc
+import warnings
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    CheckpointCallback,
+    EvalCallback,
+    EveryNTimesteps,
+    ProgressBarCallback,
+    StopTrainingOnMaxEpisodes,
+)
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_dce import OfflineBC, OfflineDCE, Transitions
+from sb3_dce.base import OfflineAlgorithm
+from sb3_dce.buffers import OfflineReplayBuffer
+from sb3_dce.envs import SpacesEnv
+from sb3_dce.errors import (
+    CheckpointError,
+    ConfigError,
+    DatasetFormatError,
+    DatasetNotFoundError,
+    DatasetSemanticsError,
+    DatasetWarning,
+    DivergenceError,
+)
+from sb3_dce.execution import Engine
+from sb3_dce.networks import StandardizedExtractor
+
+
+class Agent(NamedTuple):
+    """A class under test with its settings, and the names it logs under ``train/`` besides the common ones."""
+
+    cls: type[OfflineAlgorithm]
+    kwargs: dict[str, Any]
+    metrics: str
+
+
+COMMON_METRICS = "actor_loss action_dist grad_norm_actor learning_rate n_updates sec_per_1000"
+CRITIC_METRICS = (
+    "q_data q_data_std q_data_min q_data_max q0_data q1_data q_policy q_gap value_next td_target td_mse critic_loss beta "
+    "beta_eff penalty gap_td beta_pred_shift survival_margin ent_coef ent_coef_loss entropy action_sat twin_gap grad_norm_q epoch"
+)
+VALUE_METRICS = "value value_loss adv adv_pos_frac grad_norm_v"
+AGENTS = {
+    "DCE": Agent(OfflineDCE, {}, f"{CRITIC_METRICS} {VALUE_METRICS}"),
+    "DCE-without-V": Agent(OfflineDCE, {"use_v": False, "td_loss_coef": 0.5, "beta": 1.0}, CRITIC_METRICS),
+    "BC": Agent(OfflineBC, {}, "bc_loss"),
+    "BC-likelihood": Agent(OfflineBC, {"bc_loss": "nll"}, "bc_loss"),
+}
+
+
+@pytest.fixture(params=AGENTS)
+def agent(request: pytest.FixtureRequest) -> Agent:
+    return AGENTS[request.param]
+
+
+def accepts(agent: Agent, name: str) -> bool:
+    return name in inspect.signature(agent.cls).parameters
+
+
+def make(agent: Agent, **kwargs: Any) -> OfflineAlgorithm:
+    """A tiny agent; ``kwargs`` replace its settings."""
+    settings = {"batch_size": 16, "learning_rate": 1e-3, "seed": 0, "execution": "eager", **agent.kwargs, **kwargs}
+    settings["policy_kwargs"] = {"net_arch": [16, 16], **kwargs.get("policy_kwargs", {})}
+    return agent.cls("MlpPolicy", **settings)
+
+
+def weights(model: OfflineAlgorithm) -> dict[str, th.Tensor]:
+    """Everything that training changes, copied: networks with targets, optimizers, temperature."""
+    found = {f"policy.{k}": v.clone() for k, v in model.policy.state_dict().items()}
+    for name, state in model.get_parameters().items():
+        for index, moments in state.get("state", {}).items():
+            found |= {f"{name}.{index}.{k}": v for k, v in moments.items()}
+    if getattr(model, "log_ent_coef", None) is not None:
+        found["log_ent_coef"] = model.log_ent_coef.detach().clone()
+    return found
+
+
+def same(one: dict[str, th.Tensor], other: dict[str, th.Tensor]) -> bool:
+    return one.keys() == other.keys() and all(th.equal(one[key], other[key]) for key in one)
+
+
+def some_observations(n: int = 10, shape: tuple[int, ...] = (5,)) -> np.ndarray:
+    return np.random.default_rng(1).standard_normal((n, *shape))
+
+
+class Recorder(BaseCallback):
+    """Notes the counters at every step; stops with ``answer`` at step ``stop_at``."""
+
+    def __init__(self, stop_at: int | None = None, answer: Any = False) -> None:
+        super().__init__()
+        self.stop_at, self.answer = stop_at, answer
+        self.seen: list[tuple[int, int]] = []
+        self.kept: list[dict[str, th.Tensor]] = []
+
+    def _on_step(self) -> Any:
+        self.seen.append((self.num_timesteps, self.model._n_updates))
+        self.kept.append(weights(self.model))
+        return self.answer if len(self.seen) == self.stop_at else True
+
+
+# -- save and load -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("by_stream", [False, True], ids=["path", "stream"])
+def test_loaded_model_is_the_saved_one(agent: Agent, transitions: Transitions, tmp_path: Path, by_stream: bool) -> None:
+    model = make(agent, dataset=transitions).learn(5)
+    target = io.BytesIO() if by_stream else tmp_path / "model"
+    model.save(target)
+    if by_stream:
+        target.seek(0)
+    loaded = agent.cls.load(target)
+    assert same(weights(model), weights(loaded))
+    obs = some_observations()
+    assert np.array_equal(model.predict(obs, deterministic=True)[0], loaded.predict(obs, deterministic=True)[0])
+    assert (loaded.num_timesteps, loaded._n_updates) == (5, 5)
+
+
+def test_loaded_model_goes_on_as_if_never_stopped(agent: Agent, hdf5_file: Path, tmp_path: Path) -> None:
+    model = make(agent, dataset=hdf5_file).learn(7)
+    model.save(tmp_path / "model.zip")
+    model.learn(6, reset_num_timesteps=False)
+    loaded = agent.cls.load(tmp_path / "model.zip").learn(6, reset_num_timesteps=False)
+    assert same(weights(model), weights(loaded))
+    assert loaded.num_timesteps == loaded._n_updates == 13
+
+
+def test_load_without_env_predicts_and_learns(agent: Agent, hdf5_file: Path, tmp_path: Path) -> None:
+    make(agent, dataset=hdf5_file).save(tmp_path / "model.zip")
+    loaded = agent.cls.load(tmp_path / "model.zip")
+    assert loaded.env is None
+    assert loaded.predict(some_observations())[0].shape == (10, 2)
+    assert loaded.learn(3).num_timesteps == 3
+
+
+def test_model_without_a_file_needs_data_after_loading(agent: Agent, transitions: Transitions, tmp_path: Path) -> None:
+    make(agent, dataset=transitions).save(tmp_path / "model.zip")
+    loaded = agent.cls.load(tmp_path / "model.zip")
+    with pytest.raises(ConfigError, match="nothing to learn from"):
+        loaded.learn(1)
+    loaded.set_dataset(transitions)
+    assert loaded.learn(2)._n_updates == 2
+
+
+def test_saved_model_is_small_and_loading_allocates_no_buffer(
+    agent: Agent, random_transitions: Callable[..., Transitions], tmp_path: Path
+) -> None:
+    # 200,000 rows of 14 float32 columns are 11 MB; SB3's own buffer of that size would be allocated by load()
+    model = make(agent, dataset=random_transitions(200_000)).learn(1)
+    model.save(tmp_path / "model.zip")
+    assert (tmp_path / "model.zip").stat().st_size < 1e6
+    tracemalloc.start()
+    loaded = agent.cls.load(tmp_path / "model.zip")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 5e6
+    assert loaded.replay_buffer.size() == 0 and loaded.replay_buffer.rows is None
+
+
+def test_zip_has_the_members_of_stable_baselines3(agent: Agent, transitions: Transitions, tmp_path: Path) -> None:
+    model = make(agent, dataset=transitions)
+    model.save(tmp_path / "model.zip")
+    names = set(zipfile.ZipFile(tmp_path / "model.zip").namelist())
+    assert {"data", "policy.pth", "actor.optimizer.pth", "pytorch_variables.pth", "system_info.txt"} <= names
+    if agent.cls is OfflineDCE:
+        assert {"critic.optimizer.pth", "ent_coef_optimizer.pth"} <= names
+        assert ("value_net.optimizer.pth" in names) == model.use_v
+
+
+def test_failed_save_leaves_the_old_file(
+    agent: Agent, transitions: Transitions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "model.zip"
+    model = make(agent, dataset=transitions)
+    model.save(path)
+    before = path.read_bytes()
+    model.learn(2)
+
+    def no_space(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", no_space)
+    with pytest.raises(CheckpointError, match=r"model\.zip.*No space left"):
+        model.save(path)
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["model.zip"]
+
+
+def test_save_that_fails_halfway_leaves_the_old_file(agent: Agent, transitions: Transitions, tmp_path: Path) -> None:
+    path = tmp_path / "model.zip"
+    model = make(agent, dataset=transitions)
+    model.save(path)
+    before = path.read_bytes()
+    model.unpicklable = open(os.devnull)  # noqa: SIM115
+    with pytest.raises(Exception, match="pickle"):
+        model.save(path)
+    model.unpicklable.close()
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["model.zip"]
+
+
+def test_model_with_nan_weights_is_not_saved(agent: Agent, transitions: Transitions, tmp_path: Path) -> None:
+    model = make(agent, dataset=transitions)
+    with th.no_grad():
+        next(model.policy.actor.parameters())[0, 0] = float("nan")
+    with pytest.raises(DivergenceError, match="refusing to save: actor"):
+        model.save(tmp_path / "model.zip")
+    assert not (tmp_path / "model.zip").exists()
+
+
+def test_parameters_can_be_taken_and_put_back(agent: Agent, transitions: Transitions) -> None:
+    model = make(agent, dataset=transitions).learn(3)
+    taken, policy = model.get_parameters(), copy.deepcopy(model.policy.state_dict())
+    kept = copy.deepcopy(taken)
+    model.learn(3)
+    assert all(th.equal(taken["policy"][k], kept["policy"][k]) for k in policy), "the copy must not follow the training"
+    assert not same(policy, model.policy.state_dict())
+    model.set_parameters(taken)
+    assert same(policy, model.policy.state_dict())
+    after = model.get_parameters()
+    assert str(after) == str(kept)
+    model.learn(3)  # the engine notices that other tensors lie behind the modules
+    assert not same(policy, model.policy.state_dict())
+
+
+def test_foreign_parameters_are_refused(agent: Agent, transitions: Transitions) -> None:
+    model = make(agent, dataset=transitions)
+    parameters = model.get_parameters()
+    del parameters["actor.optimizer"]
+    with pytest.raises(CheckpointError, match=r"actor\.optimizer"):
+        model.set_parameters(parameters)
+
+
+def test_unknown_arguments_are_refused(agent: Agent, transitions: Transitions, tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="learning_starts"):
+        make(agent, dataset=transitions, learning_starts=100)
+    make(agent, dataset=transitions).save(tmp_path / "model.zip")
+    with pytest.raises(ConfigError, match="learning_rat'.*Did you mean 'learning_rate'"):
+        agent.cls.load(tmp_path / "model.zip", learning_rat=1e-4)
+    assert agent.cls.load(tmp_path / "model.zip", learning_rate=1e-4).learning_rate == 1e-4
+
+
+# Renamed or wrapped by Stable-Baselines3 itself; `dataset` is kept as id or path.
+CHANGED_BY_SB3 = {"policy", "env", "device", "dataset", "policy_kwargs", "stats_window_size", "_init_setup_model"}
+
+
+def test_every_argument_is_readable_under_its_name(agent: Agent, hdf5_file: Path, tmp_path: Path) -> None:
+    given = {
+        "learning_rate": 2e-4,
+        "batch_size": 17,
+        "tau": 0.01,
+        "gamma": 0.9,
+        "gradient_steps": 2,
+        "tensorboard_log": str(tmp_path / "tb"),
+        "seed": 3,
+        "reward_scale": 0.5,
+        "ent_coef": "auto_0.5",
+        "target_entropy": -1.0,
+        "beta": 2.0,
+        "beta_final": 1.0,
+        "beta_rate": 0.5,
+        "critic_dropout": 0.1,
+        "max_grad_norm": 3.0,
+    }
+    given = {name: value for name, value in given.items() if accepts(agent, name)}
+    model = make(agent, dataset=hdf5_file, **given)
+    model.save(tmp_path / "model.zip")
+    defaults = {name: p.default for name, p in inspect.signature(agent.cls).parameters.items() if name not in CHANGED_BY_SB3}
+    for candidate in (model, agent.cls.load(tmp_path / "model.zip")):
+        for name, value in {**defaults, **agent.kwargs, "execution": "eager", **given}.items():
+            assert getattr(candidate, name) == value, name
+        assert candidate.dataset == str(hdf5_file.resolve())
+        assert candidate.policy_kwargs == {"net_arch": [16, 16]}
+        assert candidate.device == th.device("cpu")
+
+
+# -- determinism -------------------------------------------------------------------------------------------------------
+
+
+def test_seed_decides_the_run(agent: Agent, transitions: Transitions) -> None:
+    runs = [weights(make(agent, dataset=transitions, seed=seed).learn(5)) for seed in (0, 0, 1)]
+    assert same(runs[0], runs[1])
+    assert not same(runs[0], runs[2])
+
+
+def test_training_does_not_depend_on_global_generators(agent: Agent, transitions: Transitions) -> None:
+    runs = []
+    for _ in range(2):
+        model = make(agent, dataset=transitions)
+        np.random.rand(3 * len(runs)), th.rand(5 * len(runs))
+        runs.append(weights(model.learn(5)))
+    assert same(*runs)
+
+
+def test_two_short_runs_equal_a_long_one(agent: Agent, transitions: Transitions) -> None:
+    schedule = {"beta": 2.0, "beta_final": 1.0, "beta_rate": 0.5, "beta_update_every": 1, "steps_per_epoch": 4}
+    schedule = schedule if accepts(agent, "beta") else {}
+    long, short = (make(agent, dataset=transitions, **schedule) for _ in range(2))
+    long.learn(12)
+    short.learn(6)
+    short.learn(6, reset_num_timesteps=False)
+    assert same(weights(long), weights(short))
+    assert short.num_timesteps == short._n_updates == long.num_timesteps == long._n_updates == 12
+    assert long.coefficients(long._n_updates) == short.coefficients(short._n_updates)
+    if schedule:
+        assert short.coefficients(12)["beta"] == 1.0
+
+
+def test_new_count_of_timesteps_goes_on_with_the_updates(agent: Agent, transitions: Transitions) -> None:
+    model = make(agent, dataset=transitions).learn(4)
+    model.learn(3)
+    assert (model.num_timesteps, model._n_updates) == (3, 7)
+
+
+# -- learn() and callbacks ---------------------------------------------------------------------------------------------
+
+
+def test_learn_takes_floats_and_returns_the_model(agent: Agent, transitions: Transitions) -> None:
+    model = make(agent, dataset=transitions)
+    assert model.learn(1e1) is model
+    assert model.num_timesteps == model._n_updates == 10
+    with pytest.raises(ConfigError, match="total_timesteps"):
+        model.learn(-1)
+
+
+@pytest.mark.parametrize("gradient_steps", [1, 4])
+@pytest.mark.parametrize("answer", [False, np.bool_(False), th.tensor(False)], ids=["bool", "numpy", "tensor"])
+def test_callback_stops_training_at_once(agent: Agent, transitions: Transitions, gradient_steps: int, answer: Any) -> None:
+    recorder = Recorder(stop_at=5, answer=answer)
+    model = make(agent, dataset=transitions, gradient_steps=gradient_steps).learn(12, recorder, log_interval=None)
+    assert len(recorder.seen) == 5
+    # the chunk of four in which it was asked to stop had been computed already
+    assert model.num_timesteps == model._n_updates == {1: 5, 4: 8}[gradient_steps]
+
+
+def test_callback_sees_as_many_updates_as_timesteps(agent: Agent, transitions: Transitions) -> None:
+    recorder = Recorder()
+    make(agent, dataset=transitions).learn(4, recorder)
+    assert recorder.seen == [(1, 1), (2, 2), (3, 3), (4, 4)]
+
+
+@pytest.mark.parametrize("gradient_steps", [1, 5])
+def test_evaluation_at_n_sees_exactly_n_updates(
+    agent: Agent, transitions: Transitions, gradient_steps: int, make_point_mass: Callable[[], gym.Env]
+) -> None:
+    recorder = Recorder()
+    evaluation = EvalCallback(make_point_mass(), callback_after_eval=recorder, eval_freq=5, n_eval_episodes=1, verbose=0)
+    model = make(agent, dataset=transitions, gradient_steps=gradient_steps)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # no Monitor around the evaluation environment
+        model.learn(10, evaluation, log_interval=None)
+    assert recorder.seen == [(5, 5), (10, 10)]
+    assert same(recorder.kept[0], weights(make(agent, dataset=transitions).learn(5)))
+
+
+def test_training_mode_is_restored_after_an_evaluation(
+    agent: Agent, transitions: Transitions, make_point_mass: Callable[[], gym.Env], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, modes = make(agent, dataset=transitions), []
+    original = Engine.step
+
+    def step(self: Engine, *args: Any, **kwargs: Any) -> None:
+        modes.append({name: net.training for name, net in model.policy.named_children()})
+        original(self, *args, **kwargs)
+
+    monkeypatch.setattr(Engine, "step", step)
+    evaluation = EvalCallback(make_point_mass(), eval_freq=2, n_eval_episodes=1, verbose=0, warn=False)
+    model.learn(6, evaluation, log_interval=None)
+    assert len(modes) == 6
+    for mode in modes:
+        assert all(training == ("target" not in name) for name, training in mode.items()), mode
+
+
+def test_training_never_steps_its_environment(agent: Agent, transitions: Transitions, spaces_env: SpacesEnv) -> None:
+    with pytest.raises(RuntimeError, match="cannot be stepped"):
+        spaces_env.step(np.zeros(2))
+    assert make(agent, env=spaces_env, dataset=transitions).learn(3).num_timesteps == 3
+
+
+def test_usual_callbacks_work_together(
+    agent: Agent, transitions: Transitions, tmp_path: Path, make_point_mass: Callable[[], gym.Env]
+) -> None:
+    every = Recorder()
+    callbacks = CallbackList(
+        [
+            CheckpointCallback(4, str(tmp_path), save_replay_buffer=False),
+            EveryNTimesteps(3, every),
+            StopTrainingOnMaxEpisodes(100),
+            EvalCallback(make_point_mass(), eval_freq=6, n_eval_episodes=1, log_path=str(tmp_path), verbose=0, warn=False),
+            ProgressBarCallback(),
+        ]
+    )
+    model = make(agent, dataset=transitions).learn(12, callbacks)
+    assert sorted(p.name for p in tmp_path.glob("*.zip")) == [f"rl_model_{n}_steps.zip" for n in (12, 4, 8)]
+    assert [n for n, _ in every.seen] == [3, 6, 9, 12]
+    assert np.load(tmp_path / "evaluations.npz")["timesteps"].tolist() == [6, 12]
+    checkpoint = agent.cls.load(tmp_path / "rl_model_12_steps.zip")
+    assert same(weights(model), weights(checkpoint))
+
+
+def test_progress_bar_flag(agent: Agent, transitions: Transitions) -> None:
+    assert make(agent, dataset=transitions).learn(3, progress_bar=True).num_timesteps == 3
+
+
+@pytest.mark.parametrize("name", ["eval_freq", "save_freq", "n_steps", "log_interval"])
+def test_frequency_that_is_no_multiple_of_gradient_steps_is_refused(
+    name: str, agent: Agent, transitions: Transitions, tmp_path: Path, make_point_mass: Callable[[], gym.Env]
+) -> None:
+    callback = {
+        "eval_freq": lambda: EvalCallback(make_point_mass(), eval_freq=10, verbose=0, warn=False),
+        "save_freq": lambda: CallbackList([CheckpointCallback(10, str(tmp_path))]),
+        "n_steps": lambda: EveryNTimesteps(10, Recorder()),
+        "log_interval": lambda: None,
+    }[name]()
+    model = make(agent, dataset=transitions, gradient_steps=4)
+    with pytest.raises(ConfigError, match=f"{name}=10 .*gradient_steps=4"):
+        model.learn(20, callback, log_interval=10 if name == "log_interval" else None)
+    assert model.num_timesteps == model._n_updates == 0
+
+
+# -- logging -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("gradient_steps", [1, 2])
+def test_log_has_the_promised_names(agent: Agent, transitions: Transitions, tmp_path: Path, gradient_steps: int) -> None:
+    model = make(agent, dataset=transitions, gradient_steps=gradient_steps)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(8, log_interval=4)
+    with (tmp_path / "progress.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    names = {f"train/{name}" for name in f"{COMMON_METRICS} {agent.metrics}".split()}
+    names |= {"time/fps", "time/time_elapsed", "time/total_timesteps"}
+    assert names <= set(rows[0])
+    assert [int(row["time/total_timesteps"]) for row in rows] == [4, 8]
+    assert [int(row["train/n_updates"]) for row in rows] == [4, 8]
+    assert all(np.isfinite(float(value)) for row in rows for value in row.values())
+    assert not any(name.startswith("rollout/") for name in rows[0])
+
+
+def test_log_interval_none_writes_nothing(agent: Agent, transitions: Transitions, tmp_path: Path) -> None:
+    model = make(agent, dataset=transitions)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(8, log_interval=None)
+    assert (tmp_path / "progress.csv").read_text() == ""
+
+
+def count_reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """From now on, note every way by which a number leaves a tensor."""
+    reads: list[str] = []
+    for name in ("item", "tolist", "numpy", "cpu", "__float__", "__int__", "__bool__", "__index__", "__array__"):
+        original = getattr(th.Tensor, name)
+
+        def method(self: th.Tensor, *args: Any, _name: str = name, _original: Any = original, **kwargs: Any) -> Any:
+            reads.append(_name)
+            return _original(self, *args, **kwargs)
+
+        monkeypatch.setattr(th.Tensor, name, method)
+    return reads
+
+
+def test_training_reads_nothing_back(agent: Agent, transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = make(agent, dataset=transitions)
+    model.train(1, 16)
+    reads = count_reads(monkeypatch)
+    model.train(5, 16)
+    assert reads == []
+
+
+# -- spaces, networks, data --------------------------------------------------------------------------------------------
+
+
+def test_observations_may_have_any_shape(agent: Agent, random_transitions: Callable[..., Transitions], tmp_path: Path) -> None:
+    env = SpacesEnv(spaces.Box(-10.0, 10.0, (2, 3), np.float32), spaces.Box(-1.0, 1.0, (2,), np.float32))
+    data = random_transitions(obs_dim=6)
+    model = make(agent, env=env, dataset=data).learn(2)
+    assert model.predict(some_observations(4, (2, 3)))[0].shape == (4, 2)
+    assert model.replay_buffer.observations.shape == (len(data), 1, 2, 3)
+    assert np.array_equal(model.replay_buffer.observations.reshape(-1, 6), data.observations)
+    model.save(tmp_path / "model.zip")
+    assert agent.cls.load(tmp_path / "model.zip").predict(some_observations(4, (2, 3)))[0].shape == (4, 2)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_actions_have_the_bounds_and_type_of_their_space(
+    agent: Agent, random_transitions: Callable[..., Transitions], dtype: type
+) -> None:
+    low, high = np.array([-2.0, 0.0], dtype), np.array([2.0, 3.0], dtype)
+    env = SpacesEnv(spaces.Box(-np.inf, np.inf, (5,), np.float64), spaces.Box(low, high, dtype=dtype))
+    rows = random_transitions(act_dim=2)
+    actions = ((rows.actions + 1) / 2 * (high - low) + low).astype(np.float32)
+    data = Transitions.from_arrays(
+        rows.observations, actions, rows.rewards, rows.terminals, rows.timeouts, action_low=low, action_high=high
+    )
+    model = make(agent, env=env, dataset=data).learn(3)
+    held = model.replay_buffer.actions[:, 0]
+    n = len(held)
+    assert np.allclose(held, rows.actions[:n], atol=1e-6), "the buffer holds actions scaled to [-1, 1]"
+    predicted = model.predict(100 * some_observations(), deterministic=False)[0]
+    assert predicted.dtype == dtype
+    assert (predicted >= low).all() and (predicted <= high).all()
+    assert predicted[:, 1].min() > 0.0
+
+
+class TwoLayers(BaseFeaturesExtractor):
+    """A user's own extractor with parameters."""
+
+    def __init__(self, observation_space: spaces.Box, width: int = 7) -> None:
+        super().__init__(observation_space, width)
+        self.layer = th.nn.Linear(observation_space.shape[0], width)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.layer(observations).tanh()
+
+
+@pytest.mark.parametrize(
+    "policy_kwargs",
+    [
+        {"net_arch": {"pi": [8], "qf": [12, 4]}},
+        {"net_arch": []},
+        {"n_critics": 1},
+        {"n_critics": 3},
+        {"activation_fn": th.nn.Tanh},
+        {"optimizer_class": th.optim.AdamW, "optimizer_kwargs": {"weight_decay": 0.01}},
+        {"features_extractor_class": TwoLayers, "features_extractor_kwargs": {"width": 6}},
+    ],
+    ids=str,
+)
+def test_policy_arguments(agent: Agent, hdf5_file: Path, tmp_path: Path, policy_kwargs: dict[str, Any]) -> None:
+    model = make(agent, dataset=hdf5_file, policy_kwargs=policy_kwargs)
+    start = weights(model)
+    model.learn(3)
+    after = weights(model)
+    still = [k for k, v in start.items() if k.startswith("policy.actor") and k.endswith("weight") and th.equal(v, after[k])]
+    assert still == ([] if agent.kwargs.get("bc_loss", "nll") == "nll" else ["policy.actor.log_std.weight"])
+    model.save(tmp_path / "model.zip")
+    loaded = agent.cls.load(tmp_path / "model.zip").learn(2, reset_num_timesteps=False)
+    assert same(weights(loaded), weights(model.learn(2, reset_num_timesteps=False)))
+
+
+@pytest.mark.parametrize(
+    ("policy_kwargs", "error"),
+    [
+        ({"optimizer_class": th.optim.SGD}, "Adam"),
+        ({"optimizer_kwargs": {"amsgrad": True}}, "amsgrad"),
+        ({"share_features_extractor": True}, "share_features_extractor"),
+    ],
+    ids=str,
+)
+def test_unsupported_policy_arguments_are_refused(
+    agent: Agent, transitions: Transitions, policy_kwargs: dict[str, Any], error: str
+) -> None:
+    with pytest.raises(ConfigError, match=error):
+        make(agent, dataset=transitions, policy_kwargs=policy_kwargs).learn(1)
+
+
+@pytest.mark.parametrize("name", ["CnnPolicy", "MultiInputPolicy", "MlpPolice"])
+def test_other_policies_are_refused(agent: Agent, transitions: Transitions, name: str) -> None:
+    with pytest.raises(ConfigError, match="MlpPolicy"):
+        agent.cls(name, dataset=transitions)
+
+
+def test_neither_environment_nor_dataset(agent: Agent, spaces_env: SpacesEnv) -> None:
+    with pytest.raises(ConfigError, match="neither an environment nor a dataset"):
+        make(agent)
+    model = make(agent, env=spaces_env)
+    assert model.predict(some_observations())[0].shape == (10, 2)
+    recorder = Recorder()
+    with pytest.raises(ConfigError, match="no dataset"):
+        model.learn(5, recorder)
+    assert recorder.seen == []
+
+
+def test_missing_file_is_reported_when_the_model_is_made(agent: Agent, tmp_path: Path) -> None:
+    with pytest.raises(DatasetNotFoundError, match=r"no\.hdf5"):
+        make(agent, dataset=tmp_path / "no.hdf5")
+
+
+def test_dataset_of_another_environment_is_refused(
+    agent: Agent, spaces_env: SpacesEnv, random_transitions: Callable[..., Transitions]
+) -> None:
+    model = make(agent, env=spaces_env, dataset=random_transitions(obs_dim=4))
+    with pytest.raises(DatasetFormatError, match="width 4"):
+        model.learn(1)
+
+
+def test_other_dataset_can_be_set(agent: Agent, transitions: Transitions, hdf5_file: Path) -> None:
+    half = Transitions.from_arrays(
+        *(a[:150] for a in (transitions.observations, transitions.actions, transitions.rewards)),
+        transitions.terminals[:150].astype(bool),
+        transitions.timeouts[:150],
+        transitions.next_observations[:150],
+    )
+    model = make(agent, dataset=hdf5_file).learn(2)
+    model.set_dataset(half)
+    model.learn(2, reset_num_timesteps=False)
+    assert model.replay_buffer.size() == 150
+    assert (model.num_timesteps, model.dataset) == (4, None)
+    model.set_dataset(str(hdf5_file))
+    assert model.learn(2, reset_num_timesteps=False).replay_buffer.size() == 300
+    assert model.dataset == str(hdf5_file)
+
+
+def test_attaching_copies_nothing_and_changes_nothing(agent: Agent, transitions: Transitions) -> None:
+    before = transitions.rows.copy()
+    model = make(agent, dataset=transitions).learn(3)
+    assert np.shares_memory(model.replay_buffer.observations, transitions.rows)
+    assert np.array_equal(before, transitions.rows)
+
+
+def test_environment_can_be_replaced(agent: Agent, transitions: Transitions, make_point_mass: Callable[[], gym.Env]) -> None:
+    model = make(agent, dataset=transitions).learn(2)
+    model.set_env(make_point_mass())
+    model.learn(2, reset_num_timesteps=False)
+    assert model.num_timesteps == 4
+    assert isinstance(model.get_env().envs[0].unwrapped, type(make_point_mass()))
+
+
+def test_environment_with_other_spaces_is_refused(agent: Agent, transitions: Transitions, tmp_path: Path) -> None:
+    other = SpacesEnv(spaces.Box(-np.inf, np.inf, (4,), np.float64), spaces.Box(-1.0, 1.0, (2,), np.float32))
+    model = make(agent, dataset=transitions)
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        model.set_env(other)
+    model.save(tmp_path / "model.zip")
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        agent.cls.load(tmp_path / "model.zip", env=other)
+
+
+def test_discrete_actions_are_refused(agent: Agent, transitions: Transitions) -> None:
+    env = SpacesEnv(spaces.Box(-1.0, 1.0, (5,), np.float32), spaces.Discrete(2))
+    with pytest.raises((AssertionError, ValueError), match="Box"):
+        make(agent, env=env, dataset=transitions)
+
+
+def test_observation_statistics_of_vec_normalize_are_used(
+    agent: Agent, transitions: Transitions, make_point_mass: Callable[[], gym.Env], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = VecNormalize(DummyVecEnv([make_point_mass]), training=False, norm_reward=False)
+    env.obs_rms.mean, env.obs_rms.var = np.full(5, 0.5), np.full(5, 4.0)
+    batches = []
+    original = Engine.step
+
+    def step(self: Engine, batch: Any, *args: Any, **kwargs: Any) -> None:
+        batches.append(batch)
+        original(self, batch, *args, **kwargs)
+
+    monkeypatch.setattr(Engine, "step", step)
+    make(agent, env=env, dataset=transitions).learn(1)
+    make(agent, dataset=transitions).learn(1)
+    normalised, raw = (batch.observations.numpy() for batch in batches)
+    assert np.allclose(normalised, (raw - 0.5) / np.sqrt(4.0 + 1e-8), atol=1e-6)
+
+
+def test_evaluation_environment_may_be_normalised_too(
+    agent: Agent, transitions: Transitions, make_point_mass: Callable[[], gym.Env]
+) -> None:
+    env, eval_env = (VecNormalize(DummyVecEnv([make_point_mass])) for _ in range(2))
+    callback = EvalCallback(eval_env, eval_freq=2, n_eval_episodes=1, verbose=0, warn=False)
+    assert make(agent, env=env, dataset=transitions).learn(4, callback, log_interval=None).num_timesteps == 4
+
+
+def test_policy_can_be_evaluated(agent: Agent, transitions: Transitions, make_point_mass: Callable[[], gym.Env]) -> None:
+    model = make(agent, env=make_point_mass(), dataset=transitions).learn(3)
+    rewards, lengths = evaluate_policy(model, make_point_mass(), n_eval_episodes=3, return_episode_rewards=True, warn=False)
+    assert len(rewards) == 3 and all(1 <= length <= 20 for length in lengths)
+    # the reward of a step is between 1.8 and 3
+    assert all(1.8 * length <= reward <= 3 * length for reward, length in zip(rewards, lengths, strict=True))
+
+
+def test_observations_are_standardised_with_the_datasets_statistics(agent: Agent, hdf5_file: Path, tmp_path: Path) -> None:
+    model = make(agent, dataset=hdf5_file, normalize_obs=True).learn(2)
+    observations = model.replay_buffer.observations[:, 0]
+    mean, std = observations.mean(axis=0), observations.std(axis=0)
+    extractors = [m for m in model.policy.modules() if isinstance(m, StandardizedExtractor)]
+    assert len(extractors) == len([net for net in model.policy.children() if net is not None])
+    for extractor in extractors:
+        got = extractor(th.as_tensor(observations)).numpy()
+        assert np.allclose(got, (observations - mean) / (std + 1e-3), atol=1e-4)
+    model.save(tmp_path / "model.zip")
+    loaded = agent.cls.load(tmp_path / "model.zip")
+    assert np.array_equal(
+        loaded.predict(observations, deterministic=True)[0], model.predict(observations, deterministic=True)[0]
+    )
+
+
+# -- divergence --------------------------------------------------------------------------------------------------------
+
+
+def test_absurd_learning_rate_is_noticed(agent: Agent, transitions: Transitions) -> None:
+    model = make(agent, dataset=transitions, learning_rate=1e30)
+    with pytest.raises(DivergenceError, match="diverged between updates 0 and 10.*not finite"):
+        model.learn(20, log_interval=10)
+
+
+def test_broken_numbers_in_the_buffer_are_noticed(agent: Agent, transitions: Transitions) -> None:
+    model = make(agent, dataset=transitions, batch_size=256)
+    model.attach_dataset()
+    buffer = model.replay_buffer
+    assert isinstance(buffer, OfflineReplayBuffer)
+    buffer.rows = buffer.rows.clone()
+    column = 0 if agent.cls is OfflineBC else buffer.obs_dim + buffer.action_dim
+    buffer.rows[::3, column] = float("inf")
+    with pytest.raises(DivergenceError, match="not finite"):
+        model.learn(20, log_interval=5)
+
+
+@pytest.mark.parametrize("key", ["observations", "actions", "rewards", "next_observations"])
+def test_nan_in_the_data_is_refused(key: str, arrays: dict[str, np.ndarray]) -> None:
+    broken = {name: values.copy() for name, values in arrays.items()}
+    broken[key][7] = np.nan
+    with pytest.raises(DatasetSemanticsError, match=f"{key} has .* NaN"):
+        Transitions.from_arrays(**broken)
+
+
+# -- wrong arguments ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("batch_size", 0),
+        ("batch_size", 2.5),
+        ("gradient_steps", 0),
+        ("learning_rate", -1e-3),
+        ("tau", 1.5),
+        ("gamma", -0.1),
+        ("execution", "jit"),
+        ("reward_normalization", "max"),
+        ("reward_scale", 0.0),
+        ("bc_loss", "l1"),
+        ("expectile", 1.0),
+        ("expectile", float("nan")),
+        ("beta", -1.0),
+        ("beta", float("inf")),
+        ("beta_rate", 0.5),
+        ("beta_update_every", 0),
+        ("td_loss_coef", 0.0),
+        ("ent_coef", "automatic"),
+        ("ent_coef", "auto_x"),
+        ("ent_coef", -0.1),
+        ("target_entropy", "small"),
+        ("penalty_action_source", "data"),
+        ("penalty_form", "quadratic"),
+        ("n_penalty_actions", 0),
+        ("v_target_reduction", "max"),
+        ("v_target_timing", "later"),
+        ("actor_q", "second"),
+        ("policy_update_freq", 0),
+        ("critic_dropout", 1.0),
+        ("critic_weight_decay", -1.0),
+        ("max_grad_norm", -1.0),
+        ("max_grad_norm", 0.0),
+        ("q_target_clip", -1.0),
+    ],
+)
+def test_wrong_argument_is_refused_by_the_constructor(agent: Agent, spaces_env: SpacesEnv, name: str, value: Any) -> None:
+    if not accepts(agent, name):
+        pytest.skip(f"{agent.cls.__name__} has no {name}")
+    with pytest.raises(ConfigError, match=name):
+        make(agent, env=spaces_env, **{name: value})
+
+
+# -- DCE only ----------------------------------------------------------------------------------------------------------
+
+DCE = AGENTS["DCE"]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"n_penalty_actions": 2, "penalty_action_source": "dataset"},
+        {"use_v": False, "use_target_v": True},
+        {"use_v": False, "penalty_form": "hinge"},
+    ],
+    ids=str,
+)
+def test_impossible_combination_is_refused(spaces_env: SpacesEnv, settings: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError):
+        make(DCE, env=spaces_env, **settings)
+
+
+@pytest.mark.parametrize(("saved", "wanted"), [("auto", 0.5), (0.5, "auto")])
+def test_temperature_cannot_change_its_kind_at_load(
+    saved: str | float, wanted: str | float, transitions: Transitions, tmp_path: Path
+) -> None:
+    make(DCE, dataset=transitions, ent_coef=saved).save(tmp_path / "model.zip")
+    with pytest.raises(CheckpointError, match="ent_coef"):
+        OfflineDCE.load(tmp_path / "model.zip", ent_coef=wanted)
+
+
+def test_fixed_temperature_can_change_at_load(hdf5_file: Path, tmp_path: Path) -> None:
+    make(DCE, dataset=hdf5_file, ent_coef=0.5).save(tmp_path / "model.zip")
+    loaded = OfflineDCE.load(tmp_path / "model.zip", ent_coef=2.0)
+    loaded.learn(2, log_interval=None)
+    assert loaded.read_metrics()["ent_coef"] == 2.0
+
+
+def test_training_with_a_fixed_temperature_reads_nothing_back(
+    transitions: Transitions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = make(DCE, dataset=transitions, ent_coef=0.5)
+    model.train(1, 16)
+    reads = count_reads(monkeypatch)
+    model.train(5, 16)
+    assert reads == []
+
+
+def test_dropout_changes_training_and_not_prediction(transitions: Transitions) -> None:
+    plain, dropped = (make(DCE, dataset=transitions, critic_dropout=rate) for rate in (0.0, 0.5))
+    obs = some_observations()
+    assert np.array_equal(plain.predict(obs, deterministic=True)[0], dropped.predict(obs, deterministic=True)[0])
+    plain.learn(2), dropped.learn(2)
+    assert not same(plain.critic.state_dict(), dropped.critic.state_dict())
+    s, a = th.as_tensor(obs, dtype=th.float32), th.zeros(10, 2)
+    dropped.policy.set_training_mode(True)
+    assert th.equal(dropped.critic(s, a)[0], dropped.critic(s, a)[0])
+
+
+def test_beta_above_the_mean_reward_of_terminating_data_warns(transitions: Transitions) -> None:
+    # mean reward 2.4 per step: beta_eff = 6 / 2 exceeds it, 4 / 2 does not
+    with pytest.warns(DatasetWarning, match="ending an episode becomes attractive"):
+        make(DCE, dataset=transitions, beta=6.0).learn(1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DatasetWarning)
+        make(DCE, dataset=transitions, beta=4.0).learn(1)
+
+
+def test_survival_margin_is_in_the_rewards_the_agent_sees(transitions: Transitions) -> None:
+    model = make(DCE, dataset=transitions, beta=1.0, reward_scale=0.5, reward_shift=0.25).learn(2, log_interval=None)
+    expected = 0.5 * transitions.info.reward_mean + 0.25 - 0.5
+    assert model.read_metrics()["survival_margin"] == pytest.approx(expected, rel=1e-6)
+
+
+def test_iql_normalisation_divides_by_the_range_of_returns(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = make(DCE, dataset=transitions, reward_normalization="iql", reward_scale=2.0)
+    model.learn(1, log_interval=None)
+    returns = transitions.info.episode_returns
+    assert model.coefficients(0)["reward_scale"] == pytest.approx(2000.0 / (returns.max() - returns.min()), rel=1e-9)
+
+
+def test_long_run_after_a_short_one_is_compiled(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``execution="auto"`` decides by the updates of the run at hand, not by those of the first one."""
+    planned: list[int] = []
+
+    def choose(execution: str, planned_updates: int) -> str:
+        planned.append(planned_updates)
+        return "eager"
+
+    monkeypatch.setattr("sb3_dce.base.choose_execution", choose)
+    model = make(DCE, dataset=transitions, execution="auto").learn(2)
+    model.learn(100_000, Recorder(stop_at=2), log_interval=None)
+    assert max(planned) == 100_000
+
+
+def test_divergence_is_noticed_at_the_end_of_a_short_run(transitions: Transitions) -> None:
+    model = make(DCE, dataset=transitions, learning_rate=1e30)
+    with pytest.raises(DivergenceError):
+        model.learn(20)
+
+
+def test_default_ids_of_the_catalogue_give_the_spaces(tmp_path: Path) -> None:
+    model = OfflineDCE("MlpPolicy", dataset="hopper-medium", policy_kwargs={"net_arch": [4]})
+    assert model.dataset == "hopper-medium-v2"
+    assert model.observation_space.shape == (11,) and model.action_space.shape == (3,)
