@@ -32,7 +32,7 @@ DatasetArgument = Annotated[str, typer.Argument(help="Id such as [b]walker2d-med
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("runs/demo"),
-    seeds: Annotated[int, typer.Option(min=1, max=20, help="Seeds of DCE and of BC.")] = 3,
+    seeds: Annotated[int, typer.Option(min=1, max=20, help="Seeds of DCE and of BC.")] = 2,
     fresh: Annotated[bool, typer.Option(help="Start anew even if the folder holds results.")] = False,
 ) -> None:
     """Train DCE and behavioural cloning on the data that come with the package and compare them. A few minutes."""

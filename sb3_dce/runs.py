@@ -23,6 +23,7 @@ from sb3_dce.agents import agent_class
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.data import find_file
 from sb3_dce.data.hashes import file_sha256
+from sb3_dce.errors import ConfigError
 from sb3_dce.evaluation import Evaluation, EvaluationCallback, catalogue_id, make_eval_env, write_evaluations
 from sb3_dce.files import write_atomically
 
@@ -98,8 +99,9 @@ def run(spec: RunSpec, report: Report = lambda progress: None) -> dict[str, Any]
     :raises SB3DCEError: if something is wrong with data, parameters or files
     """
     folder = Path(spec.folder)
+    _refuse_other_run(spec, folder)
     done = read_result(folder)
-    if done is not None and done["n_updates"] == spec.n_updates and done["config"] == _config(spec):
+    if done is not None and done["n_updates"] == spec.n_updates:
         return done
     folder.mkdir(parents=True, exist_ok=True)
     model = _model(spec, folder)
@@ -150,11 +152,32 @@ def _config(spec: RunSpec) -> dict[str, Any]:
     return {key: value for key, value in asdict(spec).items() if key != "folder"}
 
 
+def _refuse_other_run(spec: RunSpec, folder: Path) -> None:
+    """A run is only continued with the settings it was begun with; it may be made longer."""
+    path = folder / "config.yml"
+    if not path.is_file():
+        return
+    begun = (yaml.safe_load(path.read_text(encoding="utf-8")) or {}).get("run", {})
+    wanted = _plain(_config(spec))
+    differing = [key for key in wanted if key != "n_updates" and begun.get(key) != wanted[key]]
+    done = read_result(folder)
+    if done is not None and done["n_updates"] > spec.n_updates:
+        differing.append("n_updates")
+    if differing:
+        changes = ", ".join(f"{key}={begun.get(key)!r} there, {wanted[key]!r} now" for key in differing)
+        raise ConfigError(
+            f"the folder holds a run with other settings: {changes}",
+            where=str(folder),
+            path=folder,
+            hint="Choose another folder with --out, or delete this one.",
+        )
+
+
 def _model(spec: RunSpec, folder: Path) -> OfflineAlgorithm:
     agent = agent_class(spec.algo)
-    checkpoint = folder / "checkpoint.zip"
-    if checkpoint.is_file():
-        return agent.load(checkpoint)
+    for name in ("checkpoint.zip", "model.zip"):  # interrupted, or complete and now made longer
+        if (folder / name).is_file():
+            return agent.load(folder / name)
     model = agent.load_dataset(spec.dataset, seed=spec.seed, **spec.overrides)
     model.num_timesteps = 0
     return model

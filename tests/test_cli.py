@@ -113,6 +113,12 @@ def test_the_same_command_does_not_repeat_finished_runs(
     assert model.stat().st_mtime_ns == before
 
 
+def test_a_folder_with_another_run_is_refused(trained: tuple[Path, Outcome]) -> None:
+    cwd, _ = trained
+    message = refused(sb3_dce(*TRAIN, "--set", "beta=1.5", "--out", str(cwd / "runs" / f"dce-{TINY}")))
+    assert "other settings" in message and "--out" in message
+
+
 def test_an_interrupted_run_goes_on_and_ends_like_an_uninterrupted_one(tmp_path: Path) -> None:
     """The first call is killed after its first checkpoint; the second ends with the same weights and evaluations."""
     arguments = ("train", TINY, "--updates", "60", "--eval-freq", "20", "--eval-episodes", "1", *FAST)

@@ -104,6 +104,7 @@ class PlainDCE:
     def __init__(self, model: OfflineDCE) -> None:
         self.m = model
         self.probes: dict[str, tuple[th.Tensor, float]] = {}
+        self.branches: dict[str, set[bool]] = {}
         for name in NETS:
             setattr(self, name, copy.deepcopy(getattr(model.policy, name)))
         kwargs = dict(model.policy.optimizer_kwargs)
@@ -118,6 +119,10 @@ class PlainDCE:
         if model.log_ent_coef is not None:
             self.log_ent_coef = model.log_ent_coef.detach().clone().requires_grad_()
             self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=rate)
+
+    def note(self, name: str, condition: th.Tensor) -> None:
+        """Remember which sides of a case distinction have occurred; a test that sees one side only proves little."""
+        self.branches.setdefault(name, set()).update(condition.flatten().tolist())
 
     def pi(self, s: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         hidden = self.actor.latent_pi(self.actor.features_extractor(s))
@@ -145,9 +150,10 @@ class PlainDCE:
             return None
         return [[noise[f"{prefix}_{i}_{j}"][rows] for j in range(2)] for i in range(len(self.critic.q_networks))]
 
-    @staticmethod
-    def reduce(values: list[th.Tensor], how: str) -> th.Tensor:
+    def reduce(self, values: list[th.Tensor], how: str) -> th.Tensor:
         stacked = th.stack(values)
+        if len(values) > 1 and how == "min":
+            self.note("first critic is the smallest", stacked.argmin(dim=0) == 0)
         return {"min": stacked.min(dim=0).values, "mean": stacked.mean(dim=0), "first": stacked[0]}[how]
 
     def penalty_actions(self, batch: ReplayBufferSamples, noise: dict[str, th.Tensor]) -> list[th.Tensor]:
@@ -176,9 +182,11 @@ class PlainDCE:
     def penalty(self, q_pen: list[th.Tensor], q_data: th.Tensor, v: th.Tensor | None) -> th.Tensor:
         """Penalty of one critic without beta; ``q_pen`` has one tensor per action a'."""
         if self.m.penalty_floor is not None:
+            self.note("penalised value is above the floor", th.stack(q_pen) > self.m.penalty_floor)
             q_pen = [th.where(q > self.m.penalty_floor, q, th.full_like(q, self.m.penalty_floor)) for q in q_pen]
         stacked = th.stack(q_pen)
         if self.m.penalty_form == "hinge":
+            self.note("penalised value is above V", stacked > v)
             return F.relu(stacked - v).mean()
         if self.m.penalty_form == "cql":
             return stacked.mean() - q_data.mean()
@@ -205,6 +213,7 @@ class PlainDCE:
 
             def v_loss() -> th.Tensor:
                 u = q_t - self.v(self.value_net, s)
+                self.note("advantage is negative", u < 0)
                 return th.where(u < 0, (1 - m.expectile) * u**2, m.expectile * u**2).mean()
 
             self.take(self.value_optimizer, v_loss, self.value_net)
@@ -215,6 +224,7 @@ class PlainDCE:
         # 2 critics
         y = r + m.gamma * (1 - d) * next_values
         if m.q_target_clip is not None:
+            self.note("target is clipped", y.abs() > m.q_target_clip)
             y = th.clamp(y, -m.q_target_clip, m.q_target_clip)
 
         def q_loss() -> th.Tensor:
@@ -330,6 +340,7 @@ def test_update_equals_the_plain_restatement(case: str, transitions: Transitions
         plain.step(step, beta_at(model, n))
     assert largest_difference(all_tensors(model), plain.tensors()) <= 1e-10
     assert largest_difference(start, model.policy.state_dict()) > 1e-3
+    assert {name: sides for name, sides in plain.branches.items() if len(sides) < 2} == {}
 
 
 # -- ways of running an update -----------------------------------------------------------------------------------------
