@@ -155,8 +155,7 @@ class AttachingMixin(OffPolicyAlgorithm):
             "return_range": info.return_range,
             "n_terminals": int(info.n_terminals),
         }
-        reward_mean = self._reward_factor() * info.reward_mean + self.reward_shift
-        for text in self.check_dataset_fits(reward_mean, info.n_terminals):
+        for text in self.check_dataset_fits(self._mean_reward(), info.n_terminals):
             warnings.warn(text, DatasetWarning)
         if self.normalize_obs:
             self._standardize(transitions)
@@ -169,6 +168,11 @@ class AttachingMixin(OffPolicyAlgorithm):
         :return: texts of warnings
         """
         return []
+
+    def _mean_reward(self) -> float:
+        """Mean reward per row as the agent sees it."""
+        assert self.dataset_statistics is not None
+        return self._reward_factor() * self.dataset_statistics["reward_mean"] + self.reward_shift
 
     def _reward_factor(self) -> float:
         """Factor on the rewards of the data."""

@@ -129,6 +129,8 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         self._generator: th.Generator | None = None
         self._coef: dict[str, th.Tensor] = {}
         self._warned_large_q = False
+        self._new_run = True
+        self.stats_window_size = stats_window_size
 
     # -- to be stated by a subclass --------------------------------------------------------------------------------
 
@@ -215,6 +217,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
 
     def _setup_model(self) -> None:
         self.check_parameters()
+        self._stats_window_size = self.stats_window_size
         given = self.policy_kwargs
         self.policy_kwargs = {**self.policy_settings(), **given}
         try:
@@ -272,7 +275,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         buffer = self.replay_buffer
         assert isinstance(buffer, OfflineReplayBuffer)
         self.policy.set_training_mode(True)  # evaluation leaves the policy in evaluation mode
-        engine = self._bound_engine(gradient_steps)
+        engine = self._bound_engine(max(self._total_timesteps - self.num_timesteps, gradient_steps))
         generator, specs = self._training_generator(), self.noise_specs(batch_size)
         dtype = next(self.policy.parameters()).dtype
         for storage in engine.state.storages.values():
@@ -287,15 +290,24 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
             engine.step(batch, noise, self._coefficient_tensors(dtype), **self.update_variant(self._n_updates))
             self._n_updates += 1
 
-    def _bound_engine(self, gradient_steps: int) -> Engine:
-        """The engine, made anew when the modules' tensors were replaced (loading, ``set_parameters``, ``to``)."""
-        if self._engine is None or not self._engine.state.is_bound():
-            metrics = None if self._engine is None else self._engine.metrics
+    def _bound_engine(self, planned_updates: int) -> Engine:
+        """
+        The engine, made anew when the modules' tensors were replaced (loading, ``set_parameters``, ``to``), or when a long
+        run begins that is worth compiling. What is compiled stays so: the price is paid.
+        """
+        engine = self._engine if self._engine is not None and self._engine.state.is_bound() else None
+        execution = None if engine is None else engine.execution
+        if engine is None or (self._new_run and execution == "eager"):
+            execution = choose_execution(self.execution, planned_updates)
+        self._new_run = False
+        if engine is None or execution != engine.execution:
             storages = self.make_storages()
-            planned = max(getattr(self, "_total_timesteps", 0) - self.num_timesteps, gradient_steps)
-            self._engine = Engine(self.make_update(storages), TrainState(storages), choose_execution(self.execution, planned))
-            self._engine.metrics = metrics or self._engine.metrics
-        return self._engine
+            assert execution is not None
+            engine = Engine(self.make_update(storages), TrainState(storages), execution)
+            if self._engine is not None:
+                engine.metrics = self._engine.metrics
+            self._engine = engine
+        return engine
 
     def _coefficient_tensors(self, dtype: th.dtype) -> dict[str, th.Tensor]:
         for name, value in self.coefficients(self._n_updates).items():
@@ -339,6 +351,8 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
             self.train(gradient_steps=chunk, batch_size=self.batch_size)
             keep_going = self._count_steps(chunk, callback, log_interval)
+        if self._engine is not None:  # a run may be shorter than the intervals of the log
+            refuse_divergence(self._engine.metrics.read(clear=False), self._num_timesteps_at_start, self._n_updates)
         callback.on_training_end()
         return self
 
@@ -358,6 +372,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         if self.env is None:
             self.set_env(SpacesEnv(self.observation_space, self.action_space))
         self._metrics_read_at = (time.time_ns(), self._n_updates)
+        self._new_run = True
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 
     def _check_frequencies(self, callback: BaseCallback, log_interval: int | None) -> None:

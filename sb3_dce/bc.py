@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, S
 from sb3_dce import losses
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
-from sb3_dce.checks import check_choice
+from sb3_dce.checks import check_choice, check_optional
 from sb3_dce.execution import Update
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import ActorPolicy
@@ -81,6 +81,7 @@ class OfflineBC(OfflineAlgorithm):
     def check_parameters(self) -> None:
         super().check_parameters()
         check_choice("bc_loss", self.bc_loss, ("mse", "nll"))
+        check_optional("max_grad_norm", self.max_grad_norm)
 
     def _create_aliases(self) -> None:
         self.actor = self.policy.actor

@@ -25,7 +25,7 @@ def check_number(
     :param name: name of the parameter
     :param value: what the user gave
     :param low: smallest allowed value
-    :param high: largest allowed value
+    :param high: largest allowed value; infinity itself is never allowed
     :param open_low: ``low`` itself is not allowed
     :param open_high: ``high`` itself is not allowed
     :param integer: only whole numbers are allowed
@@ -35,10 +35,22 @@ def check_number(
     kinds = (int, np.integer) if integer else (int, float, np.integer, np.floating)
     ok = isinstance(value, kinds) and not isinstance(value, bool)
     ok = ok and (value > low if open_low else value >= low) and (value < high if open_high else value <= high)
+    ok = ok and value < float("inf")
     if not ok:
         interval = f"{'(' if open_low else '['}{low:g}, {high:g}{')' if open_high or high == float('inf') else ']'}"
         kind = "an integer" if integer else "a number"
         raise ConfigError(f"{name} must be {kind} in {interval}, got {value!r}", key=name, hint=hint)
+
+
+def check_optional(name: str, value: Any, hint: str | None = None) -> None:
+    """
+    :param name: name of a parameter that is ``None`` (off) or a positive number
+    :param value: what the user gave
+    :param hint: what to do
+    :raises ConfigError: if it is neither
+    """
+    if value is not None:
+        check_number(name, value, 0, open_low=True, hint=hint or "None switches it off.")
 
 
 def check_choice(name: str, value: Any, allowed: tuple[Any, ...]) -> None:

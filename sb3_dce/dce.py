@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, S
 from sb3_dce import losses
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
-from sb3_dce.checks import check_choice, check_number
+from sb3_dce.checks import check_choice, check_number, check_optional
 from sb3_dce.entropy import ENT_COEF, EntropyCoefficient
 from sb3_dce.errors import ConfigError
 from sb3_dce.execution import Update
@@ -210,6 +210,9 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
         check_number("critic_dropout", self.critic_dropout, 0, 1, open_high=True, hint="The paper uses 0.1 on human data.")
         for name in ("beta_update_every", "steps_per_epoch", "n_penalty_actions", "policy_update_freq"):
             check_number(name, getattr(self, name), 1, integer=True)
+        check_number("critic_weight_decay", self.critic_weight_decay, 0)
+        check_optional("max_grad_norm", self.max_grad_norm)
+        check_optional("q_target_clip", self.q_target_clip)
         check_choice("penalty_action_source", self.penalty_action_source, PENALTY_SOURCES)
         check_choice("penalty_form", self.penalty_form, PENALTY_FORMS)
         check_choice("v_target_reduction", self.v_target_reduction, REDUCTIONS)
@@ -351,7 +354,7 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
             "epoch": self._n_updates / self.steps_per_epoch,
         }
         if self.dataset_statistics is not None:
-            extra["survival_margin"] = self.dataset_statistics["reward_mean"] - means["beta_eff"]
+            extra["survival_margin"] = self._mean_reward() - means["beta_eff"]
         return extra
 
     def check_dataset_fits(self, reward_mean: float, n_terminals: int) -> list[str]:

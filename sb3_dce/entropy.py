@@ -67,8 +67,6 @@ class EntropyCoefficient:
         if learned:
             self.log_ent_coef = th.log(th.full((1,), value, device=device)).requires_grad_(True)
             self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.lr_schedule(1))  # type: ignore[attr-defined]
-        else:
-            self.ent_coef_tensor = th.tensor(value, device=device)
 
     def ent_coef_modules(self) -> list[str]:
         """
@@ -80,7 +78,7 @@ class EntropyCoefficient:
         """
         :return: names of saved tensors
         """
-        return ["log_ent_coef"] if parse_ent_coef(self.ent_coef)[0] else ["ent_coef_tensor"]
+        return ["log_ent_coef"] if parse_ent_coef(self.ent_coef)[0] else []
 
     def ent_coef_storages(self) -> dict[str, Storage]:
         """
@@ -94,12 +92,13 @@ class EntropyCoefficient:
         """
         :return: coefficients of the update
         """
-        if self.log_ent_coef is None:
-            return {"ent_coef": float(self.ent_coef_tensor)}
+        learned, value = parse_ent_coef(self.ent_coef)
+        if not learned:
+            return {"ent_coef": value}
         if self.target_entropy != "auto":
             return {"target_entropy": float(self.target_entropy)}
         return {"target_entropy": -float(np.prod(self.action_space.shape))}  # type: ignore[attr-defined]
 
     def _excluded_save_params(self) -> list[str]:
         names: list[Any] = super()._excluded_save_params()  # type: ignore[misc]
-        return [*names, "log_ent_coef", "ent_coef_optimizer", "ent_coef_tensor"]
+        return [*names, "log_ent_coef", "ent_coef_optimizer"]

@@ -67,9 +67,10 @@ class MetricSums:
         else:
             self._sums[names] = (values.clone(), 1)
 
-    def read(self) -> dict[str, float]:
+    def read(self, clear: bool = True) -> dict[str, float]:
         """
-        :return: mean of each metric since the last call; reading clears the sums
+        :param clear: start new sums
+        :return: mean of each metric since the sums were last cleared
         """
         totals: dict[str, float] = {}
         counts: dict[str, int] = {}
@@ -77,7 +78,8 @@ class MetricSums:
             for name, value in zip(names, total.tolist(), strict=True):
                 totals[name] = totals.get(name, 0.0) + value
                 counts[name] = counts.get(name, 0) + count
-        self._sums.clear()
+        if clear:
+            self._sums.clear()
         return {name: totals[name] / counts[name] for name in totals}
 
 

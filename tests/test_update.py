@@ -38,7 +38,21 @@ def make_model(data: Transitions, **kwargs: Any) -> OfflineDCE:
     if model.log_ent_coef is not None:
         model.log_ent_coef = model.log_ent_coef.detach().double().requires_grad_()
         model.ent_coef_optimizer = th.optim.Adam([model.log_ent_coef], lr=model.lr_schedule(1))
+    _centre(model)
     return model
+
+
+@th.no_grad()
+def _centre(model: OfflineDCE) -> None:
+    """Let all values be 1 on average over the data, so that both sides of every minimum and comparison occur."""
+    model.attach_dataset()
+    s, a = (th.as_tensor(array[:, 0]).double() for array in (model.replay_buffer.observations, model.replay_buffer.actions))
+    for net in (model.critic, model.critic_target):
+        for q_net, values in zip(net.q_networks, net(s, a), strict=True):
+            q_net[-1].bias += 1.0 - values.mean()
+    for net in (model.policy.value_net, model.policy.value_net_target):
+        if net is not None:
+            net.value_net[-1].bias += 1.0 - net(s).mean()
 
 
 class Step(NamedTuple):
@@ -302,7 +316,7 @@ CASES: dict[str, dict[str, Any]] = {
     "actor_q_mean": {"actor_q": "mean"},
     "v_target_mean": {"v_target_reduction": "mean"},
     "v_target_first": {"v_target_reduction": "first"},
-    "floor": {"penalty_floor": 0.0, "n_penalty_actions": 2},
+    "floor": {"penalty_floor": 1.0, "n_penalty_actions": 2},
     "hinge": {"penalty_form": "hinge", "n_penalty_actions": 2},
     "cql": {"penalty_form": "cql", "n_penalty_actions": 2},
     "logsumexp": {"penalty_form": "logsumexp", "n_penalty_actions": 3, "penalty_action_source": "uniform"},
@@ -316,7 +330,7 @@ CASES: dict[str, dict[str, Any]] = {
     "actor_every_second_step": {"policy_update_freq": 2},
     "target_v": {"use_target_v": True},
     "reward_transformed": {"reward_scale": 0.5, "reward_shift": -0.25},
-    "target_clipped": {"q_target_clip": 2.5},
+    "target_clipped": {"q_target_clip": 3.3},
     "one_critic": {"policy_kwargs": {"n_critics": 1}},
     "three_critics": {"policy_kwargs": {"n_critics": 3}},
     "falling_beta": {"beta": 2.0, "beta_final": 1.0, "beta_rate": 0.4, "beta_update_every": 1, "steps_per_epoch": 5},
