@@ -13,6 +13,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_dce import hyperparams
@@ -92,6 +93,12 @@ class AttachingMixin(OffPolicyAlgorithm):
             return None
         if isinstance(dataset, Transitions):
             self._transitions = dataset
+            if self.d4rl_compat and not dataset.info.d4rl_compat:
+                raise ConfigError(
+                    "d4rl_compat=True comes too late: the Transitions have already been made without it",
+                    key="d4rl_compat",
+                    hint="Pass d4rl_compat=True to Transitions.from_hdf5 or load_transitions.",
+                )
             self.dataset = None if dataset.info.path is None else str(Path(dataset.info.path).resolve())
             return None
         if is_path(dataset):
@@ -142,11 +149,14 @@ class AttachingMixin(OffPolicyAlgorithm):
         :raises ConfigError: if the model has no dataset
         :raises DatasetError: if the data cannot be read or do not fit the model
         """
-        assert isinstance(self.replay_buffer, OfflineReplayBuffer)
-        if self.replay_buffer.size() > 0:
+        buffer = self.replay_buffer
+        assert isinstance(buffer, OfflineReplayBuffer)
+        if buffer.size() > 0:
+            if self.dataset_statistics is None:  # filled by load_replay_buffer() or add()
+                self._take_statistics_of(buffer)
             return
         transitions = self._load_transitions()
-        self.replay_buffer.attach(transitions)
+        buffer.attach(transitions)
         info = transitions.info
         self.dataset_statistics = {
             "rows": info.rows,
@@ -158,8 +168,40 @@ class AttachingMixin(OffPolicyAlgorithm):
         for text in self.check_dataset_fits(self._mean_reward(), info.n_terminals):
             warnings.warn(text, DatasetWarning)
         if self.normalize_obs:
-            self._standardize(transitions)
+            self._standardize(buffer.observations)
         self._transitions = None  # the buffer holds the rows now
+
+    def _take_statistics_of(self, buffer: OfflineReplayBuffer) -> None:
+        """What can be known without the episodes: the range of their returns is not, which reward scaling will say."""
+        rewards = buffer.rewards[: buffer.size()]
+        self.dataset_statistics = {
+            "rows": buffer.size(),
+            "reward_mean": float(rewards.mean(dtype=np.float64)),
+            "reward_abs_max": float(np.abs(rewards).max()),
+            "return_range": 0.0,
+            "n_terminals": int(buffer.dones[: buffer.size()].sum()),
+        }
+        if self.normalize_obs:
+            self._standardize(buffer.observations[: buffer.size()])
+
+    def _prepare_vec_normalize(self) -> None:
+        """
+        Statistics of a ``VecNormalize`` around the environment: loaded ones are used as they are, fresh ones are taken from
+        the data, since no environment is stepped that could teach them. Either way they stay fixed while training.
+        """
+        env = self._vec_normalize_env
+        if env is None:
+            return
+        env.training = False
+        assert isinstance(self.replay_buffer, OfflineReplayBuffer)
+        if env.norm_reward and _is_fresh(env.ret_rms):
+            raise ConfigError(
+                "VecNormalize(norm_reward=True) has no statistics, and offline training cannot collect them",
+                key="norm_reward",
+                hint="Use norm_reward=False, or load statistics with VecNormalize.load.",
+            )
+        if env.norm_obs and isinstance(env.obs_rms, RunningMeanStd) and _is_fresh(env.obs_rms):
+            env.obs_rms.update(self.replay_buffer.observations[: self.replay_buffer.size(), 0])
 
     def check_dataset_fits(self, reward_mean: float, n_terminals: int) -> list[str]:
         """
@@ -187,11 +229,15 @@ class AttachingMixin(OffPolicyAlgorithm):
             )
         return self.reward_scale * 1000.0 / span
 
-    def _standardize(self, transitions: Transitions) -> None:
+    def _standardize(self, observations: np.ndarray) -> None:
         # Each network has its own extractor, and the moving averages cover parameters only: all get the statistics.
-        observations = transitions.observations
         mean = th.as_tensor(observations.mean(axis=0, dtype=np.float64).reshape(-1))
         std = th.as_tensor(observations.std(axis=0, dtype=np.float64).reshape(-1))
         for module in self.policy.modules():
             if isinstance(module, StandardizedExtractor):
                 module.set_statistics(mean, std)
+
+
+def _is_fresh(statistics: RunningMeanStd) -> bool:
+    """Whether running statistics have seen nothing and nobody has set them."""
+    return statistics.count < 1.0 and bool(np.all(statistics.mean == 0.0)) and bool(np.all(statistics.var == 1.0))

@@ -130,6 +130,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         self._coef: dict[str, th.Tensor] = {}
         self._warned_large_q = False
         self._new_run = True
+        self._metrics_read_at = (time.time_ns(), 0)
         self.stats_window_size = stats_window_size
 
     # -- to be stated by a subclass --------------------------------------------------------------------------------
@@ -199,6 +200,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         check_number("tau", self.tau, 0, 1, hint="The paper's Polyak coefficient is 0.005; its tau is called expectile.")
         check_number("gamma", self.gamma, 0, 1)
         check_number("reward_scale", self.reward_scale, 0, open_low=True)
+        check_number("reward_shift", self.reward_shift, -float("inf"), open_low=True)
         check_choice("execution", self.execution, EXECUTIONS)
         check_choice("reward_normalization", self.reward_normalization, (None, "iql"))
         if not callable(self.learning_rate):
@@ -351,8 +353,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
             self.train(gradient_steps=chunk, batch_size=self.batch_size)
             keep_going = self._count_steps(chunk, callback, log_interval)
-        if self._engine is not None:  # a run may be shorter than the intervals of the log
-            refuse_divergence(self._engine.metrics.read(clear=False), self._num_timesteps_at_start, self._n_updates)
+        self._refuse_divergence()  # a run may be shorter than the intervals of the log
         callback.on_training_end()
         return self
 
@@ -371,6 +372,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         self.attach_dataset()
         if self.env is None:
             self.set_env(SpacesEnv(self.observation_space, self.action_space))
+        self._prepare_vec_normalize()
         self._metrics_read_at = (time.time_ns(), self._n_updates)
         self._new_run = True
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
@@ -378,11 +380,9 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
     def _check_frequencies(self, callback: BaseCallback, log_interval: int | None) -> None:
         if log_interval is not None:
             check_number("log_interval", log_interval, 1, integer=True, hint="It counts gradient steps; None logs nothing.")
-        if self.gradient_steps == 1:
-            return
-        frequencies = {"log_interval": log_interval} if log_interval else {}
-        for name, value in [*frequencies.items(), *callback_frequencies(callback)]:
-            if value and value > 0 and value % self.gradient_steps != 0:
+        # A log row in the middle of a chunk is harmless: it shows the whole chunk.
+        for name, value in callback_frequencies(callback):
+            if value > 0 and value % self.gradient_steps != 0:
                 raise ConfigError(
                     f"{name}={value} is no multiple of gradient_steps={self.gradient_steps}",
                     key=name,
@@ -404,8 +404,10 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         for _ in range(n_steps):
             self.num_timesteps += 1
             log_due = log_interval is not None and self.num_timesteps % log_interval == 0
-            if log_due or self.num_timesteps % GUARD_INTERVAL == 0:
+            if log_due:
                 self._record_metrics()
+            elif self.num_timesteps % GUARD_INTERVAL == 0:
+                self._refuse_divergence()
             if keep_going:
                 callback.update_locals(locals())
                 keep_going = bool(callback.on_step())
@@ -413,6 +415,10 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
                     self.dump_logs()
         del new_obs, infos, rewards, dones
         return keep_going
+
+    def _refuse_divergence(self) -> None:
+        if self._engine is not None:
+            refuse_divergence(self._engine.metrics.read(clear=False), self._metrics_read_at[1], self._n_updates)
 
     def read_metrics(self) -> dict[str, float]:
         """
@@ -424,7 +430,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         if self._engine is None:
             return {}
         means = self._engine.metrics.read()
-        then, updates_then = getattr(self, "_metrics_read_at", (time.time_ns(), 0))
+        then, updates_then = self._metrics_read_at
         refuse_divergence(means, updates_then, self._n_updates)
         if not means:
             return {}

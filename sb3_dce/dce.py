@@ -211,6 +211,8 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
         for name in ("beta_update_every", "steps_per_epoch", "n_penalty_actions", "policy_update_freq"):
             check_number(name, getattr(self, name), 1, integer=True)
         check_number("critic_weight_decay", self.critic_weight_decay, 0)
+        if self.penalty_floor is not None:
+            check_number("penalty_floor", self.penalty_floor, -float("inf"), open_low=True, hint="None switches it off.")
         check_optional("max_grad_norm", self.max_grad_norm)
         check_optional("q_target_clip", self.q_target_clip)
         check_choice("penalty_action_source", self.penalty_action_source, PENALTY_SOURCES)
@@ -358,11 +360,12 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
         return extra
 
     def check_dataset_fits(self, reward_mean: float, n_terminals: int) -> list[str]:
-        beta_eff = self.beta / (2.0 * self.td_loss_coef)
+        largest = self.beta if self.beta_final is None or self.beta_rate == 0 else max(self.beta, self.beta_final)
+        beta_eff = largest / (2.0 * self.td_loss_coef)
         if n_terminals > 0 and beta_eff > reward_mean:
             return [
                 f"beta / (2 * td_loss_coef) = {beta_eff:.3g} is above the mean reward per step {reward_mean:.3g} of data with "
-                "true terminals: ending an episode becomes attractive. Lower beta or beta's start value."
+                "true terminals: ending an episode becomes attractive. Lower beta."
             ]
         return []
 

@@ -463,7 +463,7 @@ def test_progress_bar_flag(agent: Agent, transitions: Transitions) -> None:
     assert make(agent, dataset=transitions).learn(3, progress_bar=True).num_timesteps == 3
 
 
-@pytest.mark.parametrize("name", ["eval_freq", "save_freq", "n_steps", "log_interval"])
+@pytest.mark.parametrize("name", ["eval_freq", "save_freq", "n_steps"])
 def test_frequency_that_is_no_multiple_of_gradient_steps_is_refused(
     name: str, agent: Agent, transitions: Transitions, tmp_path: Path, make_point_mass: Callable[[], gym.Env]
 ) -> None:
@@ -471,12 +471,15 @@ def test_frequency_that_is_no_multiple_of_gradient_steps_is_refused(
         "eval_freq": lambda: EvalCallback(make_point_mass(), eval_freq=10, verbose=0, warn=False),
         "save_freq": lambda: CallbackList([CheckpointCallback(10, str(tmp_path))]),
         "n_steps": lambda: EveryNTimesteps(10, Recorder()),
-        "log_interval": lambda: None,
     }[name]()
     model = make(agent, dataset=transitions, gradient_steps=4)
     with pytest.raises(ConfigError, match=f"{name}=10 .*gradient_steps=4"):
-        model.learn(20, callback, log_interval=10 if name == "log_interval" else None)
+        model.learn(20, callback)
     assert model.num_timesteps == model._n_updates == 0
+
+
+def test_log_interval_need_not_be_a_multiple_of_gradient_steps(agent: Agent, transitions: Transitions) -> None:
+    assert make(agent, dataset=transitions, gradient_steps=3).learn(9).num_timesteps == 9
 
 
 def test_learning_rate_may_be_a_schedule(agent: Agent, hdf5_file: Path, tmp_path: Path) -> None:
@@ -739,9 +742,44 @@ def test_observation_statistics_of_vec_normalize_are_used(
 def test_evaluation_environment_may_be_normalised_too(
     agent: Agent, transitions: Transitions, make_point_mass: Callable[[], gym.Env]
 ) -> None:
-    env, eval_env = (VecNormalize(DummyVecEnv([make_point_mass])) for _ in range(2))
+    env, eval_env = (VecNormalize(DummyVecEnv([make_point_mass]), norm_reward=False) for _ in range(2))
     callback = EvalCallback(eval_env, eval_freq=2, n_eval_episodes=1, verbose=0, warn=False)
     assert make(agent, env=env, dataset=transitions).learn(4, callback, log_interval=None).num_timesteps == 4
+
+
+def test_fresh_observation_statistics_are_taken_from_the_data(
+    agent: Agent, transitions: Transitions, make_point_mass: Callable[[], gym.Env]
+) -> None:
+    """The reset at the start of ``learn()`` would otherwise fit them to a single observation."""
+    env = VecNormalize(DummyVecEnv([make_point_mass]), norm_reward=False)
+    make(agent, env=env, dataset=transitions).learn(2)
+    assert np.allclose(env.obs_rms.mean, transitions.observations.mean(axis=0), atol=1e-4)
+    assert np.allclose(env.obs_rms.var, transitions.observations.var(axis=0), rtol=1e-2)
+
+
+def test_fresh_reward_statistics_are_refused(
+    agent: Agent, transitions: Transitions, make_point_mass: Callable[[], gym.Env]
+) -> None:
+    with pytest.raises(ConfigError, match="norm_reward"):
+        make(agent, env=VecNormalize(DummyVecEnv([make_point_mass])), dataset=transitions).learn(2)
+
+
+def test_d4rl_rows_cannot_be_asked_of_transitions_made_without_them(agent: Agent, transitions: Transitions) -> None:
+    with pytest.raises(ConfigError, match="d4rl_compat"):
+        make(agent, dataset=transitions, d4rl_compat=True)
+
+
+def test_buffer_of_its_own_can_be_trained_on(
+    agent: Agent, transitions: Transitions, spaces_env: SpacesEnv, tmp_path: Path
+) -> None:
+    source = make(agent, dataset=transitions).learn(1)
+    source.save_replay_buffer(tmp_path / "buffer.pkl")
+    model = make(agent, env=spaces_env, normalize_obs=True)
+    model.load_replay_buffer(tmp_path / "buffer.pkl")
+    model.learn(2)
+    mean = next(m for m in model.policy.modules() if isinstance(m, StandardizedExtractor)).mean
+    assert np.allclose(mean, transitions.observations.mean(axis=0), atol=1e-5)
+    assert model.dataset_statistics is not None and model.dataset_statistics["rows"] == len(transitions)
 
 
 def test_policy_can_be_evaluated(agent: Agent, transitions: Transitions, make_point_mass: Callable[[], gym.Env]) -> None:
