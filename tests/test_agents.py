@@ -37,7 +37,7 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecVideoRecorder
 
 from sb3_dce import OfflineBC, OfflineDCE, Transitions
 from sb3_dce.base import OfflineAlgorithm
@@ -480,6 +480,22 @@ def test_frequency_that_is_no_multiple_of_gradient_steps_is_refused(
 
 def test_log_interval_need_not_be_a_multiple_of_gradient_steps(agent: Agent, transitions: Transitions) -> None:
     assert make(agent, dataset=transitions, gradient_steps=3).learn(9).num_timesteps == 9
+
+
+def test_policy_can_be_filmed_with_vec_video_recorder(
+    transitions: Transitions, make_point_mass: Callable[[], gym.Env], tmp_path: Path
+) -> None:
+    pytest.importorskip("moviepy")
+    model = make(AGENTS["DCE"], dataset=transitions).learn(2)
+    env = make_point_mass()
+    env.metadata, env.render_mode = {"render_modes": ["rgb_array"], "render_fps": 10}, "rgb_array"
+    env.render = lambda: np.zeros((64, 64, 3), dtype=np.uint8)  # type: ignore[method-assign]
+    recorder = VecVideoRecorder(DummyVecEnv([lambda: env]), str(tmp_path), lambda step: step == 0, video_length=5)
+    obs = recorder.reset()
+    for _ in range(6):
+        obs, _, _, _ = recorder.step(model.predict(obs, deterministic=True)[0])
+    recorder.close()
+    assert [path.suffix for path in tmp_path.iterdir()] == [".mp4"]
 
 
 def test_learning_rate_may_be_a_schedule(agent: Agent, hdf5_file: Path, tmp_path: Path) -> None:
