@@ -1,12 +1,26 @@
-"""Offline reinforcement learning for people who know Stable-Baselines3."""
+"""
+Offline reinforcement learning for people who know Stable-Baselines3.
 
-from sb3_dce.bc import OfflineBC
+Importing the package registers the dataset ids as Gymnasium environments. The agents, and with them PyTorch and
+Stable-Baselines3, are imported when they are first asked for, so that the command line answers at once.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from sb3_dce.data import Transitions, load_transitions
 from sb3_dce.data.catalog import normalized_score
-from sb3_dce.dce import OfflineDCE
 from sb3_dce.envs import register_envs
 
+if TYPE_CHECKING:
+    from sb3_dce.bc import OfflineBC
+    from sb3_dce.dce import OfflineDCE
+
 __version__ = "0.1.0"
+
+_AGENTS = {"OfflineBC": "sb3_dce.bc", "OfflineDCE": "sb3_dce.dce"}
 
 __all__ = [
     "OfflineBC",
@@ -17,3 +31,13 @@ __all__ = [
     "normalized_score",
     "register_envs",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _AGENTS:
+        return getattr(importlib.import_module(_AGENTS[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

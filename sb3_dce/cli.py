@@ -59,6 +59,9 @@ def train(
     ] = None,
 ) -> None:
     """Train an agent with the hyperparameters of the dataset's row. The same command resumes an interrupted run."""
+    from sb3_dce.data import find_file
+
+    find_file(dataset)  # a missing file is said before PyTorch is imported
     from sb3_dce.training import train_seeds
 
     train_seeds(

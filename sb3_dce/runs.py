@@ -184,7 +184,7 @@ def _model(spec: RunSpec, folder: Path) -> OfflineAlgorithm:
 
 
 def _seconds_before(folder: Path) -> float:
-    """Training seconds of earlier sittings, from the log files."""
+    """Training seconds before an interruption, from the log files."""
     total = 0.0
     for path in folder.glob("progress_*.csv"):
         with path.open(encoding="utf-8") as text:
