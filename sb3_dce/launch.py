@@ -36,7 +36,8 @@ def launch(specs: Sequence[RunSpec], workers: int, console: Console) -> list[dic
     :raises SB3DCEError: the first error of a run; what the others have done is kept and resumed by the same call
     """
     workers = max(1, min(workers, len(specs)))
-    threads = max(1, (os.cpu_count() or 1) // workers)
+    # The user's own setting wins: more threads than free cores make PyTorch many times slower.
+    threads = int(os.environ.get("OMP_NUM_THREADS", 0)) or max(1, (os.cpu_count() or 1) // workers)
     context = mp.get_context("spawn")
     events = context.Queue()
     with _display(console) as display:

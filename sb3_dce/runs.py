@@ -103,8 +103,9 @@ def run(spec: RunSpec, report: Report = lambda progress: None) -> dict[str, Any]
     done = read_result(folder)
     if done is not None and done["n_updates"] == spec.n_updates:
         return done
-    folder.mkdir(parents=True, exist_ok=True)
     model = _model(spec, folder)
+    model.attach_dataset()
+    folder.mkdir(parents=True, exist_ok=True)  # not before: a run that is refused leaves nothing behind
     dataset_id = catalogue_id(model.dataset)
     _write_config(spec, model, folder)
     model.set_logger(Logger(str(folder), [make_output_format("csv", str(folder), f"_{model.num_timesteps}")]))
@@ -198,7 +199,6 @@ def _seconds_before(folder: Path) -> float:
 
 
 def _write_config(spec: RunSpec, model: OfflineAlgorithm, folder: Path) -> None:
-    model.attach_dataset()
     assert model.dataset is not None
     path, _ = find_file(model.dataset)
     hyperparameters = {name: _plain(value) for name, value in model.hyperparameters().items()}
