@@ -129,6 +129,37 @@ def dataset_info(dataset: DatasetArgument) -> None:
     console.print(f"sha256 {transitions.info.sha256}")
 
 
+@datasets_app.command("download")
+def download_dataset(
+    dataset: Annotated[str, typer.Argument(metavar="ID", help="Id such as [b]walker2d-medium[/b].")],
+    cache_dir: Annotated[
+        Path | None,
+        typer.Option(show_default=False, help="Folder of the file; default: the first in which data are looked for."),
+    ] = None,
+    mirror: Annotated[
+        list[str] | None, typer.Option(metavar="URL", help="Base URL tried before the official one; repeat it.")
+    ] = None,
+    force: Annotated[bool, typer.Option(help="Download even if the file is there, and replace it.")] = False,
+) -> None:
+    """Download a D4RL dataset. The same command goes on with an interrupted download."""
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+
+    from sb3_dce.data.download import download
+
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task(dataset, total=None, visible=False)
+        path = download(
+            dataset,
+            cache_dir=cache_dir,
+            mirrors=mirror,
+            force=force,
+            progress=lambda received, size: bar.update(task, completed=received, total=size, visible=True),
+            note=lambda text: bar.console.print(f"note   {text}", markup=False),
+        )
+    console.print(f"file   {path}", markup=False)
+
+
 def _parse_overrides(pairs: list[str]) -> dict[str, Any]:
     overrides: dict[str, Any] = {}
     for pair in pairs:

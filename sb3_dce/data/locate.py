@@ -1,5 +1,5 @@
 """
-From a dataset name to a file on this machine. Nothing is downloaded.
+From a dataset name to a file on this machine. Nothing is downloaded here.
 
 Searched in this order: files that come with the package, ``$SB3_DCE_DATASETS`` (several folders may be given, separated
 as in ``$PATH``), the cache ``~/.cache/sb3_dce/datasets``, and D4RL's own folders ``$D4RL_DATASET_DIR`` and
@@ -14,9 +14,10 @@ from os import PathLike
 from pathlib import Path
 
 from sb3_dce.data.catalog import DatasetSpec, all_specs, resolve, spec_of_file
-from sb3_dce.errors import DatasetNotFoundError
+from sb3_dce.errors import DatasetError, DatasetFormatError, DatasetNotFoundError
 
 DATASETS_VARIABLE = "SB3_DCE_DATASETS"
+SUFFIXES = (".hdf5", ".h5", ".npz", ".csv", ".parquet")
 
 
 def find_file(name_or_path: str | PathLike[str]) -> tuple[Path, DatasetSpec | None]:
@@ -36,7 +37,7 @@ def find_file(name_or_path: str | PathLike[str]) -> tuple[Path, DatasetSpec | No
             raise DatasetNotFoundError("no such file", where=str(path), hint=_available_hint(), path=path)
         return path, spec_of_file(path)
     spec = resolve(os.fspath(name_or_path))
-    found = _search(spec)
+    found = search(spec)
     if found is None:
         raise _not_found(spec)
     return found, spec
@@ -47,12 +48,45 @@ def is_path(name_or_path: str | PathLike[str]) -> bool:
     Whether a dataset is given by its file rather than by its name.
 
     :param name_or_path: file, or id or alias of the catalogue
-    :return: True for a ``Path``, a text with a separator or ending in ``.hdf5`` or ``.h5``, and any existing file
+    :return: True for a ``Path``, a text with a separator or with the suffix of a dataset (``SUFFIXES``), and any existing file
     """
-    if not isinstance(name_or_path, str) or name_or_path.endswith((".hdf5", ".h5")):
+    if not isinstance(name_or_path, str) or name_or_path.endswith(SUFFIXES):
         return True
     has_separator = any(separator and separator in name_or_path for separator in (os.sep, os.altsep))
     return has_separator or Path(name_or_path).expanduser().is_file()
+
+
+def search(spec: DatasetSpec) -> Path | None:
+    """
+    The file of a dataset, looked for by D4RL's file name and by ``<id>.hdf5``.
+
+    :param spec: entry of the catalogue
+    :return: existing file, None if there is none
+    """
+    folders = [embedded_folder()] if spec.embedded else []
+    names = dict.fromkeys((spec.file_name, f"{spec.id}.hdf5"))
+    candidates = (folder / name for folder in [*folders, *search_folders()] for name in names)
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def require_file(path: str | PathLike[str]) -> Path:
+    """
+    A file that can be opened, for the formats that :func:`~sb3_dce.data.file_checks.read_head` does not know.
+
+    :param path: file
+    :return: the same, as a ``Path``
+    :raises DatasetNotFoundError: if there is no such file
+    :raises DatasetFormatError: if it is a folder or a device
+    :raises DatasetError: if it may not be read
+    """
+    path = Path(path)
+    if not path.exists():
+        raise DatasetNotFoundError("no such file", where=str(path), hint="Check the path", path=path)
+    if not path.is_file():
+        raise DatasetFormatError("not a file", where=str(path), hint="Name a file", path=path)
+    if not os.access(path, os.R_OK):
+        raise DatasetError("may not be read", where=str(path), hint="Change its mode", path=path)
+    return path
 
 
 def available() -> list[tuple[DatasetSpec, Path]]:
@@ -61,7 +95,7 @@ def available() -> list[tuple[DatasetSpec, Path]]:
 
     :return: pairs of entry and file, in the order of the catalogue
     """
-    return [(spec, path) for spec in all_specs() if (path := _search(spec)) is not None]
+    return [(spec, path) for spec in all_specs() if (path := search(spec)) is not None]
 
 
 def embedded_folder() -> Path:
@@ -97,18 +131,13 @@ def search_folders() -> list[Path]:
     return [*folders, Path("~/.d4rl/datasets").expanduser()]
 
 
-def _search(spec: DatasetSpec) -> Path | None:
-    folders = [embedded_folder()] if spec.embedded else []
-    names = dict.fromkeys((spec.file_name, f"{spec.id}.hdf5"))
-    candidates = (folder / name for folder in [*folders, *search_folders()] for name in names)
-    return next((path for path in candidates if path.is_file()), None)
-
-
 def _not_found(spec: DatasetSpec) -> DatasetNotFoundError:
     target = search_folders()[0] / spec.file_name
     here = available()
     stand_ins = [twin.id for twin, _ in here if twin.generated and twin.paper_row == spec.paper_row and twin != spec]
-    hint = f"Download {spec.url} to {target}" if spec.url else f"Put the file at {target}"
+    hint = f"Put the file at {target}"
+    if spec.url:
+        hint = f"Run: sb3-dce datasets download {spec.id} - or by hand: Download {spec.url} to {target}"
     hint += f", or name another folder in ${DATASETS_VARIABLE}, or give the path of the file."
     if stand_ins:
         hint += f" Similar data made with this package, to be asked for by their own name: {', '.join(stand_ins)}."

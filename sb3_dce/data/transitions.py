@@ -7,17 +7,23 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sb3_dce.data.build import build_rows
 from sb3_dce.data.catalog import DatasetSpec, normalized_score
-from sb3_dce.data.hashes import file_sha256
-from sb3_dce.data.hdf5 import D4RLFile
+from sb3_dce.data.hashes import content_hash, file_sha256
+from sb3_dce.data.hdf5 import D4RLFile, write_hdf5
 from sb3_dce.data.layout import CORE_KEYS, ArraySource, RowLayout
+from sb3_dce.data.npz import arrays_from_npz, npz_keys, write_npz
 from sb3_dce.data.records import DatasetInfo, ReadOptions
+from sb3_dce.data.sb3_buffer import arrays_from_replay_buffer
+from sb3_dce.data.tables import Columns, arrays_from_csv, arrays_from_dataframe, arrays_from_parquet
 from sb3_dce.errors import DatasetError, DatasetIntegrityError, DatasetSemanticsError, DatasetWarning
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +136,113 @@ class Transitions:
         return cls._build(sources, dataset_id, None, sources, spec, ReadOptions(**options))
 
     @classmethod
+    def from_npz(cls, path: str | PathLike[str], *, spec: DatasetSpec | None = None, **options: Any) -> Transitions:
+        """
+        Read an NPZ file with D4RL's keys.
+
+        :param path: file of ``numpy.savez``
+        :param spec: entry of the catalogue: expected widths and time limit
+        :param options: fields of :class:`~sb3_dce.data.records.ReadOptions`
+        :return: the dataset
+        :raises DatasetError: if the file is missing, damaged, dangerous, of another layout, or its numbers make no sense
+        """
+        read_options = ReadOptions(**options)
+        arrays = arrays_from_npz(path, max_bytes=read_options.max_bytes)
+        return cls._from_file(arrays, path, npz_keys(path), spec, read_options)
+
+    @classmethod
+    def from_csv(
+        cls,
+        path: str | PathLike[str],
+        columns: Columns | None = None,
+        *,
+        sep: str = ",",
+        spec: DatasetSpec | None = None,
+        **options: Any,
+    ) -> Transitions:
+        """
+        Read a text file with the columns ``obs_0, ..., action_0, ..., reward, terminal`` and, where present, ``timeout`` and
+        ``next_obs_0, ...``.
+
+        :param path: file with a line of column names
+        :param columns: ``observations``, ``actions``, ... to column name or names; keys left out are found by name
+        :param sep: separator, one character
+        :param spec: entry of the catalogue: expected widths and time limit
+        :param options: fields of :class:`~sb3_dce.data.records.ReadOptions`
+        :return: the dataset
+        :raises DatasetError: if the file is missing, a line of it is wrong, or its numbers make no sense
+        """
+        read_options = ReadOptions(**options)
+        arrays = arrays_from_csv(path, columns, sep=sep, max_bytes=read_options.max_bytes)
+        return cls._from_file(arrays, path, arrays, spec, read_options)
+
+    @classmethod
+    def from_parquet(
+        cls,
+        path: str | PathLike[str],
+        columns: Columns | None = None,
+        *,
+        spec: DatasetSpec | None = None,
+        **options: Any,
+    ) -> Transitions:
+        """
+        Read a Parquet file with the columns of :meth:`from_csv`. Needs pyarrow: ``pip install "sb3_dce[parquet]"``.
+
+        :param path: file
+        :param columns: ``observations``, ``actions``, ... to column name or names; keys left out are found by name
+        :param spec: entry of the catalogue: expected widths and time limit
+        :param options: fields of :class:`~sb3_dce.data.records.ReadOptions`
+        :return: the dataset
+        :raises ConfigError: if pyarrow is not installed
+        :raises DatasetError: if the file is missing or damaged, or its numbers make no sense
+        """
+        read_options = ReadOptions(**options)
+        arrays = arrays_from_parquet(path, columns, max_bytes=read_options.max_bytes)
+        return cls._from_file(arrays, path, arrays, spec, read_options)
+
+    @classmethod
+    def from_dataframe(cls, frame: pd.DataFrame, columns: Columns | None = None, **options: Any) -> Transitions:
+        """
+        Take a pandas data frame with the columns of :meth:`from_csv`.
+
+        :param frame: one row per step, in the order of time
+        :param columns: ``observations``, ``actions``, ... to column name or names; keys left out are found by name
+        :param options: options of :meth:`from_arrays`
+        :return: the dataset
+        :raises DatasetError: if a column is missing or does not consist of numbers, or the numbers make no sense
+        """
+        arrays: dict[str, Any] = arrays_from_dataframe(frame, columns)
+        return cls.from_arrays(**arrays, **options)
+
+    @classmethod
+    def from_replay_buffer(cls, buffer: Any, **options: Any) -> Transitions:
+        """
+        Take a replay buffer of Stable-Baselines3 that an off-policy algorithm has filled, in the units of the environment.
+
+        :param buffer: ``model.replay_buffer``; several environments, a full ring and ``optimize_memory_usage`` are all right
+        :param options: options of :meth:`from_arrays`; the bounds of the actions are those of the buffer's action space
+        :return: the dataset
+        :raises DatasetSecurityError: for the path of a saved buffer, which is a pickle
+        :raises DatasetError: if it is no such buffer, or its numbers make no sense
+        """
+        arrays: dict[str, Any] = arrays_from_replay_buffer(buffer)
+        space = buffer.action_space
+        bounds = {"action_low": np.ravel(space.low), "action_high": np.ravel(space.high)}
+        return cls.from_arrays(**arrays, **{**bounds, **options})
+
+    @classmethod
+    def _from_file(
+        cls,
+        arrays: Mapping[str, np.ndarray],
+        path: str | PathLike[str],
+        found_keys: Any,
+        spec: DatasetSpec | None,
+        options: ReadOptions,
+    ) -> Transitions:
+        path = Path(path)
+        return cls._build(arrays, spec.id if spec else path.stem, path, found_keys, spec, options)
+
+    @classmethod
     def _build(
         cls,
         sources: Mapping[str, ArraySource],
@@ -182,6 +295,30 @@ class Transitions:
         :return: s', shape (n, obs_dim)
         """
         return self.rows[:, self._layout.next_observations]
+
+    def to_hdf5(self, path: str | PathLike[str]) -> None:
+        """
+        Write these transitions in D4RL's layout, next observations included. :meth:`from_hdf5` reads the same rows again, bit
+        for bit, if it is given the same bounds of the actions.
+
+        :param path: file to write; an existing one is replaced when the new one is complete
+        :raises CheckpointError: if it cannot be written
+        """
+        write_hdf5(path, *self._exported())
+
+    def to_npz(self, path: str | PathLike[str]) -> None:
+        """
+        Write these transitions for :meth:`from_npz`, with the keys and the attributes of :meth:`to_hdf5`.
+
+        :param path: file to write; an existing one is replaced when the new one is complete
+        :raises CheckpointError: if it cannot be written
+        """
+        write_npz(path, *self._exported())
+
+    def _exported(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Arrays in D4RL's layout, and attributes. ``generated`` keeps a copy from passing for an official file."""
+        arrays = {key: getattr(self, key) for key in CORE_KEYS} | {"terminals": self.terminals.astype(bool)}
+        return arrays, {"dataset_id": self.info.id, "generated": True, "content_hash": content_hash(arrays)}
 
     def summary(self) -> list[str]:
         """

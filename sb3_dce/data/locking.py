@@ -1,0 +1,113 @@
+"""One process at a time: a lock file that outlives neither its owner's work nor its owner's death."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from sb3_dce.errors import DownloadError
+
+POLL_SECONDS = 0.1
+# Between looking at a dead process's lock and removing it; who dies in between leaves this file behind.
+_TAKEOVER_SECONDS = 10.0
+
+
+@contextmanager
+def exclusive(path: Path, *, limit: float = 3600.0, note: Callable[[str], None] | None = None) -> Iterator[None]:
+    """
+    Hold a lock file. A lock is waited for, unless its owner was a process of this machine that lives no more.
+
+    :param path: lock file, in an existing folder
+    :param limit: longest wait, seconds
+    :param note: called once if there is something to wait for
+    :raises DownloadError: if the lock is not free after this time
+    :raises OSError: if the folder cannot be written
+    """
+    deadline = time.monotonic() + limit
+    while not _create(path):
+        if _is_abandoned(path):
+            _remove_abandoned(path)
+            continue
+        if note is not None:
+            note(f"waiting for {_owner(path)}, which holds {path}")
+            note = None
+        if time.monotonic() > deadline:
+            raise DownloadError(
+                f"{_owner(path)} has held this lock for more than {limit:,.0f} s",
+                where=str(path),
+                hint="Delete it if that process is gone.",
+                path=path,
+            )
+        time.sleep(POLL_SECONDS)
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def _create(path: Path) -> bool:
+    try:
+        descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
+    except FileExistsError:
+        return False
+    with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+        json.dump({"pid": os.getpid(), "host": socket.gethostname()}, file)
+    return True
+
+
+def _read(path: Path) -> tuple[int, str] | None:
+    """Process and machine of the owner; None if the lock is gone, or not yet or never written."""
+    try:
+        owner = json.loads(path.read_bytes())
+        return int(owner["pid"]), str(owner["host"])
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return None
+
+
+def _owner(path: Path) -> str:
+    owner = _read(path)
+    return "another process" if owner is None else f"process {owner[0]} on {owner[1]}"
+
+
+def _is_abandoned(path: Path) -> bool:
+    owner = _read(path)
+    if owner is None:  # a process that dies before it has written its name leaves an empty lock
+        return _age(path) > _TAKEOVER_SECONDS
+    pid, host = owner
+    if host != socket.gethostname() or os.name == "nt":  # on Windows os.kill would end the process
+        return False
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return True
+    except PermissionError:  # it lives, as another user
+        return False
+    return pid <= 0  # no process has such a number
+
+
+def _age(path: Path) -> float:
+    """Seconds since a file was written, 0 if it is gone."""
+    try:
+        return time.time() - path.stat().st_mtime
+    except FileNotFoundError:
+        return 0.0
+
+
+def _remove_abandoned(path: Path) -> None:
+    """Only the owner of a second lock may look again and remove: else the lock of a faster waiter could be removed."""
+    guard = path.with_name(f"{path.name}.takeover")
+    if not _create(guard):
+        if _age(guard) > _TAKEOVER_SECONDS:
+            guard.unlink(missing_ok=True)
+        time.sleep(POLL_SECONDS)
+        return
+    try:
+        if _is_abandoned(path):
+            path.unlink(missing_ok=True)
+    finally:
+        guard.unlink(missing_ok=True)

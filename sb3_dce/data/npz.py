@@ -1,0 +1,189 @@
+"""
+NPZ files with the keys of D4RL. Like HDF5 they come from the internet and are treated as hostile.
+
+NumPy's own loader believes the header of an array when it allocates, and unpickles if it is allowed to. Here nothing is ever
+unpickled, and the size in the header has to agree with that of the archive before memory is allocated.
+"""
+
+from __future__ import annotations
+
+import tokenize
+import zipfile
+import zlib
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from math import prod
+from os import PathLike
+from pathlib import Path, PurePosixPath
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+from numpy.lib import format as npy
+
+from sb3_dce.data.file_checks import translated_errors
+from sb3_dce.data.hdf5 import DEFAULT_MAX_BYTES, MAX_OBJECTS, MAX_RATIO, RATIO_APPLIES_ABOVE
+from sb3_dce.data.layout import CORE_KEYS
+from sb3_dce.data.locate import require_file
+from sb3_dce.errors import DatasetError, DatasetFormatError, DatasetIntegrityError, DatasetSecurityError
+from sb3_dce.files import write_atomically
+
+_READ_BYTES = 2**20
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+
+
+def arrays_from_npz(path: str | PathLike[str], *, max_bytes: int = DEFAULT_MAX_BYTES) -> dict[str, np.ndarray]:
+    """
+    The arrays of an NPZ file that training uses; other members are not read.
+
+    :param path: file written with ``numpy.savez`` or ``numpy.savez_compressed``
+    :param max_bytes: largest total size of these arrays, uncompressed
+    :return: those of ``observations, actions, rewards, terminals, timeouts, next_observations`` that are there
+    :raises DatasetSecurityError: for pickled objects, odd or repeated member names, and sizes that are too large or contradict
+        each other
+    :raises DatasetFormatError: if it is no NPZ file, or a member is no array of numbers
+    :raises DatasetIntegrityError: if it is damaged
+    """
+    path = require_file(path)
+    with translated_errors(path), open(path, "rb") as file:
+        _check_signature(file, path)
+        with _zip_errors(path), zipfile.ZipFile(file) as archive:
+            members = _select(archive.infolist(), path, max_bytes)
+            return {key: _read_member(archive, member, key, path) for key, member in members.items()}
+
+
+def npz_keys(path: str | PathLike[str]) -> list[str]:
+    """
+    Names of all members of an NPZ file, for messages.
+
+    :param path: file that :func:`arrays_from_npz` has read
+    :return: names without ``.npy``
+    """
+    with zipfile.ZipFile(path) as archive:
+        return [name.removesuffix(".npy") for name in archive.namelist()]
+
+
+def write_npz(path: str | PathLike[str], arrays: Mapping[str, np.ndarray], attrs: Mapping[str, Any] | None = None) -> None:
+    """
+    Write arrays, uncompressed. An existing file is replaced only when the new one is complete.
+
+    :param path: file to write
+    :param arrays: key to array
+    :param attrs: numbers and texts, stored as members without dimensions
+    """
+    with write_atomically(Path(path)) as stream:
+        members: dict[str, Any] = {**(attrs or {}), **arrays}
+        np.savez(stream, **members)
+
+
+class _Header(NamedTuple):
+    """Header of an array."""
+
+    shape: tuple[int, ...]
+    fortran_order: bool
+    dtype: np.dtype[Any]
+
+
+def _check_signature(file: BinaryIO, path: Path) -> None:
+    head = file.read(8)
+    file.seek(0)
+    if head[:2] == b"PK":
+        return
+    if head[:1] == b"\x80" and head[1:2] <= b"\x05":
+        what = "a pickle, not NPZ; opening a pickle runs code, so this is not done here"
+        hint = "Load it yourself if you trust it and give its arrays to Transitions.from_arrays"
+        raise DatasetSecurityError(what, where=str(path), hint=hint, path=path)
+    if head.startswith(npy.MAGIC_PREFIX):
+        hint = "Load it with numpy.load and give the arrays to Transitions.from_arrays"
+        raise DatasetFormatError("a single .npy array, not NPZ", where=str(path), hint=hint, path=path)
+    what = f"not an NPZ file, it begins with {head!r}" if head else "the file is empty (0 bytes)"
+    raise DatasetIntegrityError(what, where=str(path), hint="Download or copy it again", path=path)
+
+
+@contextmanager
+def _zip_errors(path: Path) -> Iterator[None]:
+    """Errors of damaged archives that are not built-in ones."""
+    try:
+        yield
+    except (zipfile.BadZipFile, zlib.error, EOFError) as exc:
+        raise DatasetIntegrityError(
+            f"damaged: {exc or 'cut short'}", where=str(path), hint="Download or copy the file again", path=path
+        ) from exc
+
+
+def _select(infos: Iterable[zipfile.ZipInfo], path: Path, max_bytes: int) -> dict[str, zipfile.ZipInfo]:
+    """Members with the keys of a dataset, after checking the names of all and the declared sizes of these."""
+    infos = list(infos)
+    names = [info.orig_filename.removesuffix(".npy") for info in infos]
+    odd = next((name for name in names if _is_odd(name)), None)
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if odd is not None or twice or len(names) > MAX_OBJECTS:
+        what = f"more than {MAX_OBJECTS:,} members"
+        if odd is not None:
+            what = f"a member is called {odd[:60]!r}, which leads out of the archive"
+        elif twice:
+            what = f"member {twice[0][:60]!r} is there more than once"
+        raise DatasetSecurityError(what, where=str(path), hint="Write the arrays again with numpy.savez", path=path)
+    members = {name: info for name, info in zip(names, infos, strict=True) if name in CORE_KEYS}
+    total = sum(info.file_size for info in members.values())
+    if total > max_bytes:
+        raise DatasetSecurityError(
+            f"the arrays declare {total:,} bytes, the limit is {max_bytes:,}",
+            where=str(path),
+            hint=f"If the file is honest, pass max_bytes={total}",
+            path=path,
+        )
+    for key, info in members.items():
+        if info.file_size > RATIO_APPLIES_ABOVE and info.file_size > MAX_RATIO * info.compress_size:
+            what = f"declares {info.file_size:,} bytes but stores {info.compress_size:,}; data do not compress so well"
+            raise _error(DatasetSecurityError, what, path, key, "Rewrite the file with numpy.savez if it is honest")
+        if info.compress_type not in _METHODS or info.flag_bits & 1:
+            what = "encrypted, or compressed in a way NumPy does not use"
+            raise _error(DatasetFormatError, what, path, key, "Write the arrays again with numpy.savez")
+    return members
+
+
+def _is_odd(name: str) -> bool:
+    return not name or name.startswith("/") or ".." in PurePosixPath(name).parts or any(mark in name for mark in "\\:\0")
+
+
+def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo, key: str, path: Path) -> np.ndarray:
+    with archive.open(info) as stream:
+        header = _read_header(stream, key, path)
+        declared, stored = prod(header.shape) * header.dtype.itemsize, info.file_size - stream.tell()
+        if declared != stored or min(header.shape, default=0) < 0:
+            what = f"its header declares {declared:,} bytes (shape {header.shape}), the archive {stored:,}"
+            raise _error(DatasetSecurityError, what, path, key, "Write the arrays again with numpy.savez")
+        data = bytearray(stored)
+        view, end = memoryview(data), 0
+        while block := stream.read(min(_READ_BYTES, stored - end)):
+            view[end : end + len(block)] = block
+            end += len(block)
+    if end != stored:
+        raise _error(DatasetIntegrityError, f"cut short after {end:,} of {stored:,} bytes", path, key, "Copy the file again")
+    flat = np.frombuffer(data, dtype=header.dtype)
+    flat = flat.astype(header.dtype.newbyteorder("="), copy=False)
+    return flat.reshape(header.shape, order="F" if header.fortran_order else "C")
+
+
+def _read_header(stream: Any, key: str, path: Path) -> _Header:
+    """Header of an array of numbers; the stream then stands at its first byte."""
+    try:
+        version = npy.read_magic(stream)
+        read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+        header = _Header(*read(stream))
+    except (ValueError, TypeError, SyntaxError, tokenize.TokenError, MemoryError, RecursionError) as exc:
+        what = "its header is not that of a NumPy array"
+        raise _error(DatasetSecurityError, what, path, key, "Write the arrays again with numpy.savez") from exc
+    if header.dtype.hasobject:
+        what = "holds Python objects, which only a pickle can store; opening a pickle runs code"
+        hint = "Load it yourself if you trust it and save arrays of numbers"
+        raise _error(DatasetSecurityError, what, path, key, hint)
+    if header.dtype.kind not in "fiub":
+        what = f"has type {header.dtype}"
+        raise _error(DatasetFormatError, what, path, key, "Store float32 numbers and bool flags, one array per key")
+    return header
+
+
+def _error(kind: type[DatasetError], what: str, path: Path, key: str, hint: str) -> DatasetError:
+    return kind(what, where=f"{path}, key {key}", hint=hint, path=path, key=key)

@@ -1,0 +1,97 @@
+"""
+Replay buffers of Stable-Baselines3, read through their public attributes: this module imports neither it nor PyTorch.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from os import PathLike
+from typing import Any
+
+import numpy as np
+
+from sb3_dce.errors import DatasetFormatError, DatasetSecurityError, DatasetWarning
+
+_NEEDED = ("observations", "actions", "rewards", "dones", "timeouts", "pos", "full", "n_envs", "action_space")
+
+
+def arrays_from_replay_buffer(buffer: Any) -> dict[str, np.ndarray]:
+    """
+    Arrays of a filled buffer: oldest row first, one environment after the other, actions in the units of the environment.
+
+    A buffer that has begun to overwrite its oldest rows starts in the middle of an episode; that rest counts as one.
+
+    :param buffer: ``ReplayBuffer`` of Stable-Baselines3 or ``OfflineReplayBuffer`` of this package, with actions scaled to
+        [-1, 1] as all off-policy algorithms store them. With ``optimize_memory_usage=True`` it has no next observations, so
+        the last row of each environment, whose next observation is unknown, will be dropped.
+    :return: key to array
+    :raises DatasetSecurityError: if a path is given
+    :raises DatasetFormatError: if it is no such buffer, or its observations or actions are not vectors of numbers
+    """
+    if isinstance(buffer, (str, PathLike)):
+        raise DatasetSecurityError(
+            "a saved replay buffer is a pickle, and opening a pickle runs code, so this is not done here",
+            where=str(buffer),
+            hint="If you trust it, call model.load_replay_buffer(path) yourself and pass model.replay_buffer",
+            path=buffer,
+        )
+    low, high = _bounds(buffer)
+    order, n_envs = _oldest_first(buffer), int(buffer.n_envs)
+    has_next = not getattr(buffer, "optimize_memory_usage", False)
+    if not getattr(buffer, "handle_timeout_termination", True):
+        warnings.warn(
+            "this buffer was made with handle_timeout_termination=False: time limits cannot be told from true ends, so all "
+            "count as true ends",
+            DatasetWarning,
+            stacklevel=2,
+        )
+
+    def per_env(array: np.ndarray) -> np.ndarray:
+        return np.concatenate([array[order, i] for i in range(n_envs)])
+
+    dones, timeouts = per_env(buffer.dones) != 0, per_env(buffer.timeouts) != 0
+    terminals = dones & ~timeouts
+    # Where the rows of another environment begin, an episode has been cut, which is no true end.
+    last = len(order) * np.arange(1, n_envs) - 1
+    if len(order):
+        timeouts[last] |= ~terminals[last]
+    arrays = {
+        "observations": per_env(buffer.observations),
+        "actions": _unscaled(per_env(buffer.actions), low, high),
+        "rewards": per_env(buffer.rewards),
+        "terminals": terminals,
+        "timeouts": timeouts,
+    }
+    return arrays | ({"next_observations": per_env(buffer.next_observations)} if has_next else {})
+
+
+def _bounds(buffer: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Smallest and largest action, shape (act_dim,), after checking that this is a buffer with a bounded action."""
+    missing = [name for name in _NEEDED if not hasattr(buffer, name)]
+    if missing:
+        what = f"{type(buffer).__name__} is no replay buffer, it has no {', '.join(missing)}"
+        raise DatasetFormatError(what, hint="Pass model.replay_buffer of an off-policy algorithm")
+    if isinstance(buffer.observations, Mapping):
+        what = f"{type(buffer).__name__} has observations in parts: {', '.join(buffer.observations)}"
+        raise DatasetFormatError(what, hint="Flatten them into vectors and call Transitions.from_arrays", key="observations")
+    space = buffer.action_space
+    if not (hasattr(space, "low") and np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+        what = f"the actions are {space}, wanted is a Box with finite bounds"
+        raise DatasetFormatError(what, hint="Call Transitions.from_arrays with the arrays", key="actions")
+    return np.ravel(space.low), np.ravel(space.high)
+
+
+def _oldest_first(buffer: Any) -> np.ndarray:
+    """Numbers of the rows in the order of time."""
+    if not buffer.full:
+        return np.arange(buffer.pos)
+    order = (buffer.pos + np.arange(len(buffer.dones))) % len(buffer.dones)
+    # Without an array of its own, the next observation of the newest row lies over the observation of the oldest one.
+    return order[1:] if getattr(buffer, "optimize_memory_usage", False) else order
+
+
+def _unscaled(actions: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """From [-1, 1] to the bounds; entries whose bounds are -1 and 1 stay as they are, bit for bit."""
+    middle = low + 0.5 * (actions.astype(np.float64) + 1.0) * (high.astype(np.float64) - low)
+    return np.where((low == -1.0) & (high == 1.0), actions, middle.astype(np.float32))

@@ -1,0 +1,174 @@
+"""Replay buffers of Stable-Baselines3 as datasets, against the arrays that were recorded beside them."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+
+from sb3_dce.buffers import OfflineReplayBuffer
+from sb3_dce.data import Transitions, load_transitions
+from sb3_dce.data.sb3_buffer import arrays_from_replay_buffer
+from sb3_dce.errors import DatasetFormatError, DatasetSecurityError, DatasetSemanticsError, DatasetWarning
+
+OBSERVATIONS = spaces.Box(-np.inf, np.inf, (3,), np.float32)
+UNIT = spaces.Box(-1.0, 1.0, (2,), np.float32)
+WIDE = spaces.Box(np.array([-2.0, 0.0], dtype=np.float32), np.array([2.0, 10.0], dtype=np.float32))
+
+
+def fill(buffer: Any, n_steps: int, space: spaces.Box = UNIT, seed: int = 0) -> list[dict[str, np.ndarray]]:
+    """
+    Fill a buffer through ``add`` as an off-policy algorithm does.
+
+    :return: for each environment what was recorded beside it, actions in the units of the environment
+    """
+    rng = np.random.default_rng(seed)
+    n_envs = buffer.n_envs
+    obs = rng.standard_normal((n_envs, 3)).astype(np.float32)
+    records: dict[str, list[np.ndarray]] = {}
+    for _ in range(n_steps):
+        following = rng.standard_normal((n_envs, 3)).astype(np.float32)
+        scaled = rng.uniform(-1, 1, (n_envs, 2)).astype(np.float32)
+        kind = rng.choice(3, n_envs, p=[0.8, 0.1, 0.1])  # goes on, terminal, timeout
+        rewards = rng.standard_normal(n_envs).astype(np.float32)
+        infos = [{"TimeLimit.truncated": bool(k == 2)} for k in kind]
+        buffer.add(obs, following, scaled, rewards, kind != 0, infos)
+        step = {
+            "observations": obs,
+            "actions": space.low + 0.5 * (scaled + 1.0) * (space.high - space.low),
+            "rewards": rewards,
+            "terminals": kind == 1,
+            "timeouts": kind == 2,
+            "next_observations": following,
+        }
+        for key, value in step.items():
+            records.setdefault(key, []).append(value)
+        obs = np.where((kind != 0)[:, None], rng.standard_normal((n_envs, 3)), following).astype(np.float32)
+    return [{key: np.array([step[i] for step in steps]) for key, steps in records.items()} for i in range(n_envs)]
+
+
+def stacked(per_env: list[dict[str, np.ndarray]], keep: int) -> dict[str, np.ndarray]:
+    """The last ``keep`` rows of each environment, one after the other; where an environment is cut, a timeout."""
+    parts = [{key: array[-keep:].copy() for key, array in arrays.items()} for arrays in per_env]
+    for part in parts[:-1]:
+        part["timeouts"][-1] |= ~part["terminals"][-1]
+    return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+
+
+def assert_equal(got: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
+    assert set(got) == set(expected)
+    for key, array in expected.items():
+        check = np.testing.assert_allclose if key == "actions" else np.testing.assert_array_equal
+        check(got[key], array, **({"rtol": 0, "atol": 2e-6} if key == "actions" else {}), err_msg=key)
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("n_steps", [7, 40, 95])
+@pytest.mark.parametrize("space", [UNIT, WIDE], ids=["unit", "wide"])
+def test_buffer_equals_the_arrays_recorded_beside_it(n_envs: int, n_steps: int, space: spaces.Box) -> None:
+    buffer = ReplayBuffer(40 * n_envs, OBSERVATIONS, space, device="cpu", n_envs=n_envs)
+    expected = stacked(fill(buffer, n_steps, space), min(n_steps, 40))
+    assert_equal(arrays_from_replay_buffer(buffer), expected)
+
+
+def test_actions_in_unit_bounds_keep_every_bit() -> None:
+    buffer = ReplayBuffer(40, OBSERVATIONS, UNIT, device="cpu")
+    fill(buffer, 40)
+    buffer.actions[0] = np.float32(1e-30)
+    assert arrays_from_replay_buffer(buffer)["actions"].tobytes() == buffer.actions[:, 0].tobytes()
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize("n_steps", [7, 40, 95])
+def test_memory_saving_buffer_gets_next_observations_by_shift(n_envs: int, n_steps: int) -> None:
+    options = {"optimize_memory_usage": True, "handle_timeout_termination": False}
+    buffer = ReplayBuffer(40 * n_envs, OBSERVATIONS, UNIT, device="cpu", n_envs=n_envs, **options)
+    per_env = fill(buffer, n_steps)
+    for arrays in per_env:  # such a buffer does not know time limits
+        arrays["terminals"] |= arrays["timeouts"]
+        arrays["timeouts"][:] = False
+    keep = n_steps if n_steps < 40 else 39  # the oldest observation is overwritten
+    expected = stacked(per_env, keep)
+    following = expected.pop("next_observations")
+    with pytest.warns(DatasetWarning, match="all count as true ends"):
+        arrays = arrays_from_replay_buffer(buffer)
+    assert_equal(arrays, expected)
+    transitions = Transitions.from_arrays(**arrays)
+    last = np.arange(1, n_envs + 1) * keep - 1
+    used = np.delete(np.arange(n_envs * keep), last[~expected["terminals"][last]])
+    goes_on = transitions.terminals == 0
+    assert np.array_equal(transitions.observations, expected["observations"][used])
+    assert np.array_equal(transitions.next_observations[goes_on], following[used][goes_on])
+
+
+def test_dataset_has_the_bounds_of_the_action_space() -> None:
+    buffer = ReplayBuffer(100, OBSERVATIONS, WIDE, device="cpu")
+    recorded = fill(buffer, 60, WIDE)[0]
+    transitions = Transitions.from_replay_buffer(buffer)
+    np.testing.assert_allclose(transitions.actions, recorded["actions"], rtol=0, atol=2e-6)
+    assert np.array_equal(transitions.terminals.astype(bool), recorded["terminals"])
+    assert np.array_equal(transitions.timeouts, recorded["timeouts"])
+    assert transitions.info.action_high[1] > 1
+
+
+@pytest.mark.parametrize("n_steps", [7, 40, 95])
+def test_offline_replay_buffer_filled_by_add(n_steps: int) -> None:
+    buffer = OfflineReplayBuffer(40, OBSERVATIONS, WIDE, device="cpu")
+    expected = stacked(fill(buffer, n_steps, WIDE), min(n_steps, 40))
+    assert_equal(arrays_from_replay_buffer(buffer), expected)
+
+
+def test_attached_dataset_comes_back() -> None:
+    source = ReplayBuffer(100, OBSERVATIONS, UNIT, device="cpu")
+    fill(source, 60)
+    transitions = Transitions.from_replay_buffer(source)
+    buffer = OfflineReplayBuffer(1, OBSERVATIONS, UNIT, device="cpu")
+    buffer.attach(transitions)
+    again = Transitions.from_replay_buffer(buffer)
+    assert again.rows.tobytes() == transitions.rows.tobytes() and np.array_equal(again.timeouts, transitions.timeouts)
+
+
+@pytest.mark.parametrize("kind", [ReplayBuffer, OfflineReplayBuffer])
+def test_buffer_without_rows_is_empty(kind: type[ReplayBuffer]) -> None:
+    with pytest.raises(DatasetSemanticsError, match="empty: 0 rows"):
+        Transitions.from_replay_buffer(kind(10, OBSERVATIONS, UNIT, device="cpu"))
+
+
+UNSUITABLE = [
+    (lambda: DictReplayBuffer(4, spaces.Dict({"a": OBSERVATIONS}), UNIT, "cpu"), "observations in parts: a"),
+    (lambda: ReplayBuffer(4, OBSERVATIONS, spaces.Discrete(3), "cpu"), "wanted is a Box"),
+    (lambda: ReplayBuffer(4, OBSERVATIONS, spaces.Box(-np.inf, np.inf, (2,)), "cpu"), "finite bounds"),
+    (lambda: {"observations": np.zeros(3)}, "dict is no replay buffer, it has no observations"),
+]
+
+
+@pytest.mark.parametrize(("make", "message"), UNSUITABLE, ids=["parts", "discrete", "unbounded", "dictionary"])
+def test_unsuitable_buffer_is_refused(make: Any, message: str) -> None:
+    with pytest.raises(DatasetFormatError, match=message):
+        Transitions.from_replay_buffer(make())
+
+
+def test_images_are_refused() -> None:
+    buffer = ReplayBuffer(4, spaces.Box(0, 255, (3, 36, 36), np.uint8), UNIT, "cpu")
+    buffer.pos = 3
+    with pytest.raises(DatasetFormatError, match="images"):
+        Transitions.from_replay_buffer(buffer)
+
+
+def test_saved_buffer_is_never_unpickled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "replay_buffer.pkl"
+    path.write_bytes(pickle.dumps([1]))
+
+    def refuse(*args: Any, **kwargs: Any) -> None:
+        raise AssertionError("pickle was called")
+
+    monkeypatch.setattr(pickle, "load", refuse)
+    for read in (Transitions.from_replay_buffer, load_transitions):
+        for given in (path, str(path)):
+            with pytest.raises(DatasetSecurityError, match=r"pickle runs code.*load_replay_buffer\(path\) yourself"):
+                read(given)
