@@ -180,7 +180,9 @@ def names(folder: Path) -> set[str]:
 
 
 def child(script: str, host: Host, folder: Path, **options: Any) -> subprocess.Popen[str]:
-    command = [sys.executable, "-c", script, host.base, NAME, str(folder)]
+    # A test run in the background of a shell passes on that Ctrl-C is ignored.
+    hear_ctrl_c = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    command = [sys.executable, "-c", f"{hear_ctrl_c}\n{script}", host.base, NAME, str(folder)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
 
 
