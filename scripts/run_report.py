@@ -66,6 +66,8 @@ def report(folder: Path) -> str:
             f"| {config['run']['seed']} | {last.mean:.0f} ± {last.std:.0f} | {scores[-1]:.1f} | {max(scores):.1f} "
             f"| {last.n_updates:,} |"
         )
+    if any(read_evaluations(run, dataset_id)[-1].n_updates < settings["n_updates"] for run in runs):
+        lines += ["", "**Not complete**: the last column is the state reached; the same command goes on from there."]
     spread = f" ± {np.std(last_scores, ddof=1):.1f} (sample standard deviation over seeds)" if len(runs) > 1 else ""
     lines += [
         "",
