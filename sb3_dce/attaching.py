@@ -65,8 +65,7 @@ class AttachingMixin(OffPolicyAlgorithm):
         :raises ConfigError: for an unknown hyperparameter
         """
         spec = None if isinstance(name, Transitions) else find_file(name)[1]
-        rows = hyperparams.read_rows(cls.algo_name)
-        row = rows["default"] if spec is None else hyperparams.load_row(cls.algo_name, spec.id)
+        row = hyperparams.load_row(cls.algo_name, None if spec is None else spec.id)
         arguments = {**hyperparams.split_row(row).kwargs, **overrides}
         hyperparams.check_keys(cls, overrides, where=f"{cls.__name__}.load_dataset")
         hyperparams.check_keys(cls, arguments, where=f"zoo_hyperparams/{cls.algo_name}.yml")

@@ -22,7 +22,7 @@ from sb3_dce.policies import OfflineSACPolicy
 from sb3_dce.schedules import StepSchedule
 from sb3_dce.state import PureNet, Storage
 from sb3_dce.steps import descend, polyak
-from sb3_dce.theory import shift_factor
+from sb3_dce.theory import beta_eff, shift_factor
 
 PENALTY_SOURCES = ("policy", "policy_deterministic", "next_policy", "dataset", "uniform")
 PENALTY_FORMS = ("linear", "hinge", "cql", "logsumexp")
@@ -347,7 +347,7 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
             "expectile": self.expectile,
             "td_loss_coef": self.td_loss_coef,
             "beta": beta,
-            "beta_eff": beta / (2.0 * self.td_loss_coef),
+            "beta_eff": beta_eff(beta, self.td_loss_coef),
         }
 
     def derived_metrics(self, means: dict[str, float]) -> dict[str, float]:
@@ -361,10 +361,10 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
 
     def check_dataset_fits(self, reward_mean: float, n_terminals: int) -> list[str]:
         largest = self.beta if self.beta_final is None or self.beta_rate == 0 else max(self.beta, self.beta_final)
-        beta_eff = largest / (2.0 * self.td_loss_coef)
-        if n_terminals > 0 and beta_eff > reward_mean:
+        shift = beta_eff(largest, self.td_loss_coef)
+        if n_terminals > 0 and shift > reward_mean:
             return [
-                f"beta / (2 * td_loss_coef) = {beta_eff:.3g} is above the mean reward per step {reward_mean:.3g} of data with "
+                f"beta / (2 * td_loss_coef) = {shift:.3g} is above the mean reward per step {reward_mean:.3g} of data with "
                 "true terminals: ending an episode becomes attractive. Lower beta."
             ]
         return []

@@ -78,20 +78,22 @@ def read_rows(algo: str) -> dict[str, dict[str, Any]]:
     return {name: row for name, row in rows.items() if not name.endswith("-defaults")}
 
 
-def load_row(algo: str, dataset_id: str) -> dict[str, Any]:
+def load_row(algo: str, dataset_id: str | None) -> dict[str, Any]:
     """
     Hyperparameters of an algorithm on a dataset.
 
     A dataset without a row of its own uses that of the paper's dataset it stands for, else ``default``.
 
     :param algo: name of an algorithm, e.g. ``dce``
-    :param dataset_id: id or alias of the catalogue
+    :param dataset_id: id or alias of the catalogue; ``None`` for data outside it, which get ``default``
     :return: a row of the caller's own, with ``dataset`` set to the full id
     :raises ConfigError: if the algorithm is unknown or its file has no row that applies
     :raises DatasetError: if the dataset is unknown
     """
-    spec = catalog.resolve(dataset_id)
     rows = read_rows(algo)
+    if dataset_id is None:
+        return rows["default"]
+    spec = catalog.resolve(dataset_id)
     names = (spec.id, spec.paper_row, "default")
     for name in names:
         if name in rows:

@@ -191,9 +191,3 @@ class TrainState:
         """
         for name, value in new.items():
             self.storages[name].write(value)
-
-    def settings(self) -> dict[str, AdamSettings]:
-        """
-        :return: optimizer constants of each learner
-        """
-        return {name: s.settings for name, s in self.storages.items() if s.settings is not None}

@@ -53,8 +53,7 @@ def train_seeds(
     agent = agent_class(algo)
     hyperparams.check_keys(agent, overrides, where="--set")
     path, spec = find_file(dataset)
-    rows = hyperparams.read_rows(algo)
-    row = rows["default"] if spec is None else hyperparams.load_row(algo, spec.id)
+    row = hyperparams.load_row(algo, None if spec is None else spec.id)
     total = n_updates or hyperparams.split_row(row).n_timesteps
     name = path.stem if spec is None else spec.id
     folder = out or Path("runs") / f"{algo}-{name}"
