@@ -158,9 +158,12 @@ def _refuse_other_run(spec: RunSpec, folder: Path) -> None:
     path = folder / "config.yml"
     if not path.is_file():
         return
-    begun = (yaml.safe_load(path.read_text(encoding="utf-8")) or {}).get("run", {})
-    wanted = _plain(_config(spec))
-    differing = [key for key in wanted if key != "n_updates" and begun.get(key) != wanted[key]]
+    config = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    begun, wanted = config.get("run", {}), _plain(_config(spec))
+    differing = [key for key in wanted if key not in ("n_updates", "dataset") and begun.get(key) != wanted[key]]
+    # The same data may be named otherwise: by an id, from another folder, after a move.
+    if config.get("dataset", {}).get("sha256") != file_sha256(find_file(spec.dataset)[0]):
+        differing.append("dataset")
     done = read_result(folder)
     if done is not None and done["n_updates"] > spec.n_updates:
         differing.append("n_updates")
@@ -178,7 +181,9 @@ def _model(spec: RunSpec, folder: Path) -> OfflineAlgorithm:
     agent = agent_class(spec.algo)
     for name in ("checkpoint.zip", "model.zip"):  # interrupted, or complete and now made longer
         if (folder / name).is_file():
-            return agent.load(folder / name)
+            model = agent.load(folder / name)
+            model.set_dataset(spec.dataset)  # its file may have moved since
+            return model
     model = agent.load_dataset(spec.dataset, seed=spec.seed, **spec.overrides)
     model.num_timesteps = 0
     return model

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -20,7 +21,8 @@ from rich.console import Console
 from stable_baselines3.common.evaluation import evaluate_policy
 from typer.testing import CliRunner
 
-from sb3_dce import OfflineDCE, cli
+from sb3_dce import OfflineDCE, cli, cli_datasets
+from sb3_dce.data import find_file, load_transitions
 from sb3_dce.envs import make_env_if_possible
 from sb3_dce.errors import ConfigError
 
@@ -40,7 +42,8 @@ def sb3_dce(*arguments: str) -> Outcome:
     stdout, stderr = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(stdout), redirect_stderr(stderr):
         patch.setattr(sys, "argv", ["sb3-dce", *arguments])
-        patch.setattr(cli, "console", Console(highlight=False, width=200))
+        for module in (cli, cli_datasets):
+            patch.setattr(module, "console", Console(highlight=False, width=200))
         with pytest.raises(SystemExit) as ended:
             cli.main()
     return Outcome(ended.value.code or 0, stdout.getvalue(), stderr.getvalue())
@@ -117,6 +120,22 @@ def test_a_folder_with_another_run_is_refused(trained: tuple[Path, Outcome]) -> 
     cwd, _ = trained
     message = refused(sb3_dce(*TRAIN, "--set", "beta=1.5", "--out", str(cwd / "runs" / f"dce-{TINY}")))
     assert "other settings" in message and "--out" in message
+
+
+def test_a_run_goes_on_with_the_same_data_from_another_place_and_with_no_other(
+    trained: tuple[Path, Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cwd, _ = trained
+    shutil.copytree(cwd / "runs", tmp_path / "runs")
+    folder = tmp_path / "runs" / f"dce-{TINY}"
+    shutil.copy(find_file(TINY)[0], tmp_path / "moved.hdf5")
+    load_transitions(TINY).to_hdf5(tmp_path / "other.hdf5")
+    monkeypatch.chdir(tmp_path)
+    longer = ("--updates", "70", "--eval-freq", "30", "--eval-episodes", "2", "--seeds", "1", *FAST, "--out", str(folder))
+    result = sb3_dce("train", "moved.hdf5", *longer)
+    assert result.code == 0, result
+    assert json.loads((folder / "seed_0" / "result.json").read_text())["n_updates"] == 70
+    assert "dataset=" in refused(sb3_dce("train", "other.hdf5", *longer))
 
 
 def test_an_interrupted_run_goes_on_and_ends_like_an_uninterrupted_one(tmp_path: Path) -> None:
