@@ -12,7 +12,7 @@ import os
 import sys
 import time
 import warnings
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
@@ -135,11 +135,9 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
 
     # -- to be stated by a subclass --------------------------------------------------------------------------------
 
-    def make_storages(self) -> dict[str, Storage]:
-        """
-        :return: storage of each network by name
-        """
-        raise NotImplementedError
+    # Networks of the policy by attribute name. Each becomes an attribute of the agent and a storage of the update; those
+    # with an ``optimizer`` are trained, the others are targets or frozen.
+    networks: ClassVar[tuple[str, ...]]
 
     def make_update(self, storages: dict[str, Storage]) -> Update:
         """
@@ -155,9 +153,6 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         """
         raise NotImplementedError
 
-    def _create_aliases(self) -> None:
-        raise NotImplementedError
-
     def update_variant(self, n_updates: int) -> dict[str, Any]:
         """
         :param n_updates: completed updates
@@ -165,13 +160,20 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         """
         return {}
 
+    def learning_rates(self) -> dict[str, float]:
+        """
+        :return: learning rate of the next update by coefficient: ``learning_rate``, and ``<network>_learning_rate`` for
+            a network that has its own
+        """
+        return {"learning_rate": self.lr_schedule(self._current_progress_remaining)}
+
     def coefficients(self, n_updates: int) -> dict[str, float]:
         """
         :param n_updates: completed updates
         :return: numbers of the next update that may change while training
         """
         return {
-            "learning_rate": self.lr_schedule(self._current_progress_remaining),
+            **self.learning_rates(),
             "tau": self.tau,
             "gamma": self.gamma,
             "reward_scale": self._reward_factor(),
@@ -227,7 +229,8 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         finally:
             # The user's own arguments are what is saved and compared at load time.
             self.policy_kwargs = given
-        self._create_aliases()
+        for name in self.networks:
+            setattr(self, name, getattr(self.policy, name))
         self.setup_extras()
         self._engine = None
         self._coef = {}
@@ -264,6 +267,21 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         names = [n for n in inspect.signature(type(self)).parameters if n not in ("policy", "env", "_init_setup_model")]
         return {name: getattr(self, name) for name in names if hasattr(self, name)}
 
+    def make_storages(self) -> dict[str, Storage]:
+        """
+        :return: storage of each network, and of further learners, by name
+        """
+        modules = {name: getattr(self, name) for name in self.networks}
+        return {name: Storage.of(module) for name, module in modules.items() if module is not None}
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), *self.networks]
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        modules, tensors = super()._get_torch_save_params()
+        trained = [name for name in self.networks if hasattr(getattr(self, name), "optimizer")]
+        return modules + [f"{name}.optimizer" for name in trained], tensors
+
     # -- training --------------------------------------------------------------------------------------------------
 
     def train(self, gradient_steps: int, batch_size: int = 256) -> None:
@@ -280,8 +298,9 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         engine = self._bound_engine(max(self._total_timesteps - self.num_timesteps, gradient_steps))
         generator, specs = self._training_generator(), self.noise_specs(batch_size)
         dtype = next(self.policy.parameters()).dtype
-        for storage in engine.state.storages.values():
-            storage.set_learning_rate(self.lr_schedule(self._current_progress_remaining))
+        rates = self.learning_rates()
+        for name, storage in engine.state.storages.items():
+            storage.set_learning_rate(rates.get(f"{name}_learning_rate", rates["learning_rate"]))
         for _ in range(gradient_steps):
             rows = buffer.size()
             indices = th.randint(rows, (batch_size,), generator=generator, device=self.device)

@@ -31,6 +31,7 @@ class OfflineBC(OfflineAlgorithm):
     """
 
     algo_name: ClassVar[str] = "offline_bc"
+    networks = ("actor",)
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": ActorPolicy}
     policy: ActorPolicy
 
@@ -82,19 +83,6 @@ class OfflineBC(OfflineAlgorithm):
         super().check_parameters()
         check_choice("bc_loss", self.bc_loss, ("mse", "nll"))
         check_optional("max_grad_norm", self.max_grad_norm)
-
-    def _create_aliases(self) -> None:
-        self.actor = self.policy.actor
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor"]
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        modules, tensors = super()._get_torch_save_params()
-        return [*modules, "actor.optimizer"], tensors
-
-    def make_storages(self) -> dict[str, Storage]:
-        return {"actor": Storage.of(self.actor)}
 
     def make_update(self, storages: dict[str, Storage]) -> Update:
         net, settings = PureNet(self.actor, "get_action_dist_params"), storages["actor"].settings

@@ -17,6 +17,7 @@ from sb3_dce.checks import check_choice, check_number, check_optional
 from sb3_dce.entropy import ENT_COEF, EntropyCoefficient
 from sb3_dce.errors import ConfigError
 from sb3_dce.execution import Update
+from sb3_dce.networks import OfflineCritic, ValueNet
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import OfflineSACPolicy
 from sb3_dce.schedules import StepSchedule
@@ -95,8 +96,12 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
     """
 
     algo_name: ClassVar[str] = "dce"
+    networks = ("actor", "critic", "critic_target", "value_net", "value_net_target")
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": OfflineSACPolicy}
     policy: OfflineSACPolicy
+    critic: OfflineCritic
+    critic_target: OfflineCritic
+    value_net: ValueNet | None
 
     def __init__(
         self,
@@ -247,32 +252,7 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
             "critic_weight_decay": self.critic_weight_decay,
         }
 
-    def _create_aliases(self) -> None:
-        self.actor = self.policy.actor
-        self.critic = self.policy.critic
-        self.critic_target = self.policy.critic_target
-        self.value_net = self.policy.value_net
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "actor", "critic", "critic_target", "value_net"]
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        modules, tensors = super()._get_torch_save_params()
-        modules += ["actor.optimizer", "critic.optimizer"] + (["value_net.optimizer"] if self.use_v else [])
-        return modules + self.ent_coef_modules(), tensors + self.ent_coef_tensors()
-
     # -- what the base class needs ---------------------------------------------------------------------------------
-
-    def make_storages(self) -> dict[str, Storage]:
-        modules = {
-            "actor": self.actor,
-            "critic": self.critic,
-            "critic_target": self.critic_target,
-            "value_net": self.value_net,
-            "value_net_target": self.policy.value_net_target,
-        }
-        storages = {name: Storage.of(module) for name, module in modules.items() if module is not None}
-        return {**storages, **self.ent_coef_storages()}
 
     def make_update(self, storages: dict[str, Storage]) -> Update:
         nets = {
@@ -343,7 +323,6 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
         beta = self._beta_schedule().value(n_updates)
         return {
             **super().coefficients(n_updates),
-            **self.ent_coef_coefficients(),
             "expectile": self.expectile,
             "td_loss_coef": self.td_loss_coef,
             "beta": beta,

@@ -68,36 +68,34 @@ class EntropyCoefficient:
             self.log_ent_coef = th.log(th.full((1,), value, device=device)).requires_grad_(True)
             self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.lr_schedule(1))  # type: ignore[attr-defined]
 
-    def ent_coef_modules(self) -> list[str]:
+    def make_storages(self) -> dict[str, Storage]:
         """
-        :return: names of saved state dicts
+        :return: storages of the networks and, if it is learned, of the temperature
         """
-        return ["ent_coef_optimizer"] if parse_ent_coef(self.ent_coef)[0] else []
+        storages = super().make_storages()  # type: ignore[misc]
+        if self.log_ent_coef is not None:
+            storages[ENT_COEF] = Storage([self.log_ent_coef], self.ent_coef_optimizer)
+        return storages
 
-    def ent_coef_tensors(self) -> list[str]:
+    def coefficients(self, n_updates: int) -> dict[str, float]:
         """
-        :return: names of saved tensors
+        :param n_updates: completed updates
+        :return: numbers of the next update that may change while training
         """
-        return ["log_ent_coef"] if parse_ent_coef(self.ent_coef)[0] else []
-
-    def ent_coef_storages(self) -> dict[str, Storage]:
-        """
-        :return: the learner of a learned temperature
-        """
-        if self.log_ent_coef is None:
-            return {}
-        return {ENT_COEF: Storage([self.log_ent_coef], self.ent_coef_optimizer)}
-
-    def ent_coef_coefficients(self) -> dict[str, float]:
-        """
-        :return: coefficients of the update
-        """
+        coefficients = super().coefficients(n_updates)  # type: ignore[misc]
         learned, value = parse_ent_coef(self.ent_coef)
         if not learned:
-            return {"ent_coef": value}
-        if self.target_entropy != "auto":
-            return {"target_entropy": float(self.target_entropy)}
-        return {"target_entropy": -float(np.prod(self.action_space.shape))}  # type: ignore[attr-defined]
+            return {**coefficients, "ent_coef": value}
+        target = self.target_entropy
+        if target == "auto":
+            target = -float(np.prod(self.action_space.shape))  # type: ignore[attr-defined]
+        return {**coefficients, "target_entropy": float(target)}
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        modules, tensors = super()._get_torch_save_params()  # type: ignore[misc]
+        if parse_ent_coef(self.ent_coef)[0]:
+            modules, tensors = [*modules, "ent_coef_optimizer"], [*tensors, "log_ent_coef"]
+        return modules, tensors
 
     def _excluded_save_params(self) -> list[str]:
         names: list[Any] = super()._excluded_save_params()  # type: ignore[misc]
