@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import copy
 import itertools
-import shutil
-import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 import torch as th
@@ -20,10 +18,19 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 from torch.nn import functional as F
 from torch.nn.utils import parameters_to_vector, vector_to_parameters
-from torch.utils._pytree import tree_leaves, tree_map
+from update_tools import (
+    Step,
+    all_tensors,
+    check_changes_nothing_in_place,
+    check_compiled_equals_eager,
+    check_many_at_once_equal_single_runs,
+    largest_difference,
+    needs_compiler,
+    record_steps,
+    to_float64,
+)
 
 from sb3_dce import OfflineDCE, Transitions
-from sb3_dce.execution import Engine
 
 BATCH = 8
 NETS = ("actor", "critic", "critic_target", "value_net", "value_net_target")
@@ -34,10 +41,7 @@ def make_model(data: Transitions, **kwargs: Any) -> OfflineDCE:
     policy_kwargs = {"net_arch": [16, 16], **kwargs.pop("policy_kwargs", {})}
     settings = {"batch_size": BATCH, "seed": 0, "learning_rate": 1e-3, "tau": 0.05, "beta": 1.0, "execution": "eager"}
     model = OfflineDCE("MlpPolicy", dataset=data, policy_kwargs=policy_kwargs, **{**settings, **kwargs})
-    model.policy.double()
-    if model.log_ent_coef is not None:
-        model.log_ent_coef = model.log_ent_coef.detach().double().requires_grad_()
-        model.ent_coef_optimizer = th.optim.Adam([model.log_ent_coef], lr=model.lr_schedule(1))
+    to_float64(model)
     _centre(model)
     return model
 
@@ -53,52 +57,6 @@ def _centre(model: OfflineDCE) -> None:
     for net in (model.policy.value_net, model.policy.value_net_target):
         if net is not None:
             net.value_net[-1].bias += 1.0 - net(s).mean()
-
-
-class Step(NamedTuple):
-    batch: ReplayBufferSamples
-    noise: dict[str, th.Tensor]
-    coef: dict[str, th.Tensor]
-    with_actor: bool
-
-
-def record_steps(monkeypatch: pytest.MonkeyPatch) -> list[Step]:
-    """From now on, keep what each update of any engine is given."""
-    recorded: list[Step] = []
-    original = Engine.step
-
-    def step(self: Engine, batch: Any, noise: Any, coef: Any, **variant: Any) -> None:
-        # the coefficients are overwritten in place by the next step
-        recorded.append(Step(batch, dict(noise), {k: v.clone() for k, v in coef.items()}, variant["with_actor"]))
-        original(self, batch, noise, coef, **variant)
-
-    monkeypatch.setattr(Engine, "step", step)
-    return recorded
-
-
-def all_tensors(model: OfflineDCE) -> dict[str, th.Tensor]:
-    """Parameters, moments and temperature by name."""
-    found: dict[str, th.Tensor] = {}
-    for name in NETS:
-        net = getattr(model.policy, name)
-        if net is None:
-            continue
-        for key, parameter in net.named_parameters():
-            found[f"{name}.{key}"] = parameter.detach()
-            optimizer = getattr(net, "optimizer", None)
-            if optimizer is not None:
-                for moment in ("exp_avg", "exp_avg_sq"):
-                    found[f"{name}.{key}.{moment}"] = optimizer.state[parameter][moment]
-    if model.log_ent_coef is not None:
-        found["log_ent_coef"] = model.log_ent_coef.detach()
-        for moment in ("exp_avg", "exp_avg_sq"):
-            found[f"log_ent_coef.{moment}"] = model.ent_coef_optimizer.state[model.log_ent_coef][moment]
-    return found
-
-
-def largest_difference(one: dict[str, th.Tensor], other: dict[str, th.Tensor]) -> float:
-    assert one.keys() == other.keys()
-    return max(float((one[key] - other[key]).detach().abs().max()) for key in one)
 
 
 # -- the plain restatement ---------------------------------------------------------------------------------------------
@@ -259,7 +217,7 @@ class PlainDCE:
             for online, target in pairs:
                 for p, t in zip(online.parameters(), target.parameters(), strict=True):
                     t.copy_((1 - m.tau) * t + m.tau * p)
-        if not recorded.with_actor:
+        if not recorded.variant["with_actor"]:
             return
         # 4 temperature
         if self.log_ent_coef is None:
@@ -360,68 +318,25 @@ def test_update_equals_the_plain_restatement(case: str, transitions: Transitions
 # -- ways of running an update -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(not any(map(shutil.which, ("g++", "clang++"))), reason="needs a C++ compiler")
+@needs_compiler
 def test_compiled_update_equals_the_eager_one(transitions: Transitions) -> None:
     schedule = {"beta": 2.0, "beta_final": 1.0, "beta_rate": 0.25, "beta_update_every": 1, "steps_per_epoch": 10}
     # one small hidden layer: compiling is what takes the time here
-    kwargs = {"policy_kwargs": {"net_arch": [8]}, **schedule}
-    eager, compiled = (make_model(transitions, execution=execution, **kwargs) for execution in ("eager", "compile"))
-    with warnings.catch_warnings():
-        warnings.filterwarnings("error", message="compiling the update failed")
-        for _ in range(5):
-            eager.train(10, BATCH)
-            compiled.train(10, BATCH)
-    assert compiled._engine is not None and compiled._engine.execution == "compile"
+    compiled, metrics = check_compiled_equals_eager(
+        lambda **kwargs: make_model(transitions, policy_kwargs={"net_arch": [8]}, **schedule, **kwargs)
+    )
     assert len(compiled._engine._compiled) == 1, "a changed beta is no reason to compile again"
-    assert largest_difference(all_tensors(eager), all_tensors(compiled)) <= 1e-10
-    one, other = eager.read_metrics(), compiled.read_metrics()
-    one.pop("sec_per_1000"), other.pop("sec_per_1000")
-    assert other == pytest.approx(one, rel=1e-9, abs=1e-9)
     # 2, 1.75, 1.5, 1.25, 1: ten updates each
-    assert other["beta"] == pytest.approx(1.5, abs=1e-12)
+    assert metrics["beta"] == pytest.approx(1.5, abs=1e-12)
 
 
 def test_three_models_at_once_equal_three_single_runs(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
     models = [make_model(transitions, seed=seed) for seed in range(3)]
-    for model in models:
-        model.attach_dataset()
-    storages = [model.make_storages() for model in models]
-    state = tree_map(lambda *t: th.stack(t), *[{k: s.read() for k, s in each.items()} for each in storages])
-    update = models[0].make_update(storages[0])
-    recorded = record_steps(monkeypatch)
-    for model in models:
-        model.train(20, BATCH)
-
-    def one(state: Any, fields: dict[str, th.Tensor], noise: Any, coef: Any) -> Any:
-        return update(state, ReplayBufferSamples(**fields), noise, coef, with_actor=True)
-
-    together = th.vmap(one, in_dims=(0, 0, 0, None))
-    for n in range(20):
-        steps = recorded[n::20]  # one of each model
-        fields = [{k: v for k, v in step.batch._asdict().items() if v is not None} for step in steps]
-        stacked = [tree_map(lambda *t: th.stack(t), *parts) for parts in (fields, [step.noise for step in steps])]
-        with th.no_grad():
-            new, metrics = together(state, *stacked, steps[0].coef)
-        state |= new
-    for k, model in enumerate(models):
-        for name, storage in model._engine.state.storages.items():
-            for stacked, single in zip(tree_leaves(state[name]), tree_leaves(storage.read()), strict=True):
-                assert float((stacked[k] - single).abs().max()) <= 1e-12, name
-    assert metrics["q_data"].shape == (3,)
+    assert check_many_at_once_equal_single_runs(models, monkeypatch)["q_data"].shape == (3,)
 
 
 def test_update_changes_nothing_in_place(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
-    model = make_model(transitions)
-    recorded = record_steps(monkeypatch)
-    model.train(1, BATCH)
-    arguments = (model._engine.state.read(), recorded[0].batch, recorded[0].noise, recorded[0].coef)
-    tensors = [t for t in tree_leaves(arguments) if isinstance(t, th.Tensor)]
-    before = [t.clone() for t in tensors]
-    with th.no_grad():
-        first, _ = model._engine._update(*arguments, with_actor=True)
-        second, _ = model._engine._update(*arguments, with_actor=True)
-    assert all(th.equal(old, new) for old, new in zip(before, tensors, strict=True))
-    assert all(th.equal(one, other) for one, other in zip(tree_leaves(first), tree_leaves(second), strict=True))
+    check_changes_nothing_in_place(make_model(transitions), monkeypatch)
 
 
 # -- what beta and its relatives must and must not do ------------------------------------------------------------------
