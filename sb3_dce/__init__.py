@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from sb3_dce.data import Transitions, load_transitions
+from sb3_dce.data import Transitions, load_dataset, load_transitions
 from sb3_dce.data.catalog import normalized_score
 from sb3_dce.envs import register_envs
 
@@ -27,6 +27,7 @@ __all__ = [
     "OfflineDCE",
     "Transitions",
     "__version__",
+    "load_dataset",
     "load_transitions",
     "normalized_score",
     "register_envs",

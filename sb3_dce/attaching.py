@@ -122,7 +122,7 @@ class AttachingMixin(OffPolicyAlgorithm):
         transitions = self._load_transitions()
         return SpacesEnv(
             spaces.Box(-np.inf, np.inf, transitions.obs_shape, np.float64),
-            spaces.Box(-1.0, 1.0, (transitions.act_dim,), np.float32),
+            spaces.Box(transitions.info.action_space_low, transitions.info.action_space_high, dtype=np.float32),
         )
 
     def _load_transitions(self) -> Transitions:

@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dce.data.transitions import Transitions
-from sb3_dce.errors import ConfigError, DatasetFormatError
+from sb3_dce.errors import ConfigError, DatasetFormatError, DatasetSemanticsError
 
 # Rows handled at once when a column has to be rewritten; 64k rows of HalfCheetah are 10 MB.
 CHUNK_ROWS = 65_536
@@ -96,6 +96,7 @@ class OfflineReplayBuffer(ReplayBuffer):
 
         :param transitions: dataset with this buffer's observation and action widths
         :raises DatasetFormatError: if the widths differ
+        :raises DatasetSemanticsError: if actions lie outside of this buffer's action space
         """
         got = (int(np.prod(transitions.obs_shape)), transitions.act_dim)
         if got != (self.obs_dim, self.action_dim):
@@ -105,10 +106,25 @@ class OfflineReplayBuffer(ReplayBuffer):
                 where=str(transitions.info.path or transitions.info.id),
                 hint="Use the environment the data were recorded in, or another dataset.",
             )
+        self._refuse_actions_outside(transitions)
         rows = th.from_numpy(transitions._base_rows)
         self.rows = self._with_scaled_actions(rows).to(self._device)
         self._timeouts = transitions.timeouts
         self.buffer_size, self.pos, self.full = len(rows), 0, True
+
+    def _refuse_actions_outside(self, transitions: Transitions) -> None:
+        space, info = self.action_space, transitions.info
+        assert isinstance(space, spaces.Box)
+        low, high = space.low.reshape(-1), space.high.reshape(-1)
+        slack = 1e-6 * (high - low)
+        if (info.action_low < low - slack).any() or (info.action_high > high + slack).any():
+            raise DatasetSemanticsError(
+                f"actions of the data reach from {info.action_low.min():g} to {info.action_high.max():g}, the model's action "
+                f"space from {low.min():g} to {high.max():g}",
+                where=str(info.path or info.id),
+                hint="Use an environment with the action space of the data, or none: then its bounds are those of the data.",
+                key="actions",
+            )
 
     def _with_scaled_actions(self, rows: th.Tensor) -> th.Tensor:
         space = self.action_space

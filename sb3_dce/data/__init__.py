@@ -3,7 +3,7 @@
 from sb3_dce.data.catalog import DatasetSpec, all_specs, normalized_score, resolve, spec_of_file
 from sb3_dce.data.hashes import content_hash, file_sha256
 from sb3_dce.data.hdf5 import D4RLFile, write_hdf5
-from sb3_dce.data.loading import load_transitions
+from sb3_dce.data.loading import load_dataset, load_transitions
 from sb3_dce.data.locate import available, find_file
 from sb3_dce.data.records import DatasetInfo, ReadOptions
 from sb3_dce.data.transitions import Transitions
@@ -19,6 +19,7 @@ __all__ = [
     "content_hash",
     "file_sha256",
     "find_file",
+    "load_dataset",
     "load_transitions",
     "normalized_score",
     "resolve",

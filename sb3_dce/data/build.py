@@ -116,7 +116,7 @@ def build_rows(
         findings.notes.append(f"{int(bad.sum())} rows with NaN or infinite values were dropped")
         _require_rows(used, where)
     _check_content(rows, layout, summaries, sources, findings)
-    action_low, action_high = check_actions(rows[:, layout.actions], summaries["actions"], options, findings, where)
+    actions = check_actions(rows[:, layout.actions], summaries["actions"], options, findings, where)
     returns = episodes.returns(rows[:, layout.rewards.start])
     whole = _whole_episodes(episodes, returns, bad)
     if "-cloned-" not in dataset_id:  # D4RL fills these up with copies of the demonstrations
@@ -143,8 +143,10 @@ def build_rows(
         reward_mean=float(rewards.mean(dtype=np.float64)),
         reward_min=float(rewards.min()),
         reward_max=float(rewards.max()),
-        action_low=action_low,
-        action_high=action_high,
+        action_low=actions.lowest,
+        action_high=actions.highest,
+        action_space_low=actions.low,
+        action_space_high=actions.high,
         notes=tuple(findings.notes),
         warnings=tuple(findings.warnings),
     )

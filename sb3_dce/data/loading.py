@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Mapping
 from os import PathLike
 from typing import Any
 
 from sb3_dce.data.hash_record import verify_record
+from sb3_dce.data.layout import CORE_KEYS
 from sb3_dce.data.locate import find_file
 from sb3_dce.data.transitions import Transitions
+from sb3_dce.errors import ConfigError
 
 _READERS: dict[str, Callable[..., Transitions]] = {
     ".npz": Transitions.from_npz,
@@ -35,3 +38,45 @@ def load_transitions(name_or_path: str | PathLike[str], **options: Any) -> Trans
     verify_record(path)
     read = _READERS.get(path.suffix.lower(), Transitions.from_hdf5)
     return read(path, spec=spec, **options)
+
+
+def load_dataset(source: Any, **options: Any) -> Transitions:
+    """
+    The front door: whatever holds logged steps becomes a dataset.
+
+    :param source: id, alias or file as for :func:`load_transitions`; a pandas data frame; a dictionary of arrays with the
+        keys of :meth:`Transitions.from_arrays`; a replay buffer of Stable-Baselines3; or ``Transitions``
+    :param options: fields of :class:`~sb3_dce.data.records.ReadOptions`, and options of the reader
+    :return: the dataset
+    :raises ConfigError: for any other object, or options for data that are read already
+    :raises DatasetError: if something is wrong with the dataset
+    """
+    if isinstance(source, str | os.PathLike):
+        return load_transitions(source, **options)
+    if isinstance(source, Transitions):
+        if options:
+            raise ConfigError(
+                f"{', '.join(sorted(options))}: these Transitions have been read already",
+                key=next(iter(options)),
+                hint="Pass the options to the reader that made them.",
+            )
+        return source
+    if isinstance(source, Mapping):
+        unknown = sorted(set(source) - set(CORE_KEYS))
+        missing = sorted({"observations", "actions", "rewards", "terminals"} - set(source))
+        if unknown or missing:
+            raise ConfigError(
+                f"a dictionary of arrays has the keys {', '.join(CORE_KEYS)}; missing {missing}, unknown {unknown}",
+                key=str((missing + unknown)[0]),
+                hint="Rename its keys; timeouts and next_observations may be left out.",
+            )
+        return Transitions.from_arrays(**source, **options)
+    if type(source).__module__.partition(".")[0] == "pandas":
+        return Transitions.from_dataframe(source, **options)
+    if hasattr(source, "buffer_size"):
+        return Transitions.from_replay_buffer(source, **options)
+    raise ConfigError(
+        f"a dataset cannot be made of {type(source).__name__}",
+        key="source",
+        hint="Give an id, a file, a data frame, a dictionary of arrays, a replay buffer, or Transitions.",
+    )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,6 +34,22 @@ class Findings:
 
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
+
+
+class ActionRange(NamedTuple):
+    """
+    Actions of a dataset, each array of shape (act_dim,), float32.
+
+    :param lowest: smallest action found
+    :param highest: largest action found
+    :param low: lower bounds
+    :param high: upper bounds
+    """
+
+    lowest: np.ndarray
+    highest: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
 
 
 def check_finite(
@@ -71,7 +88,7 @@ def check_finite(
 
 def check_actions(
     actions: np.ndarray, summary: ColumnSummary, options: ReadOptions, findings: Findings, where: str
-) -> tuple[np.ndarray, np.ndarray]:
+) -> ActionRange:
     """
     Compare actions with their bounds, and move small excesses onto them.
 
@@ -80,11 +97,14 @@ def check_actions(
     :param options: bounds, and whether to clip
     :param findings: notes and warnings
     :param where: file, for messages
-    :return: smallest and largest action, float32, shape (act_dim,)
+    :return: what was found, and the bounds
     :raises DatasetSemanticsError: if actions are outside by more than 1 % of half the range and may not be clipped
     """
-    low, high = options.action_bounds(actions.shape[1])
     lowest, highest = summary.low.astype(np.float32), summary.high.astype(np.float32)
+    low, high = options.action_bounds(actions.shape[1], lowest, highest)
+    if options.action_scale is not None:
+        shown = ", ".join(f"{a:g}..{b:g}" for a, b in zip(low, high, strict=True))
+        findings.notes.append(f"bounds of the actions by action_scale={options.action_scale!r}: {shown}")
     half_range = (high - low) / 2
     excess = np.maximum(low - lowest, highest - high)
     if excess.max() > 0:
@@ -97,16 +117,17 @@ def check_actions(
             raise DatasetSemanticsError(
                 f"{n_outside} action entries are outside of [{low.min():g}, {high.max():g}]; range per dimension: {found}",
                 where=f"{where}, key actions",
-                hint="Give the bounds of the action space as action_low= and action_high=, or clip_actions=True",
+                hint="Give the bounds of the action space as action_low= and action_high=, or take those of the data with "
+                "action_scale='data'; clip_actions=True moves the entries onto the bounds",
                 key="actions",
                 count=n_outside,
             )
         for block in row_blocks(len(actions)):
             np.clip(actions[block], low, high, out=actions[block])
         findings.warnings.append(f"{n_outside} action entries were outside of the bounds by up to {excess.max():.2g}: clipped")
-    elif _within_half(lowest, highest, low, half_range):
+    elif options.action_scale != "data" and _within_half(lowest, highest, low, half_range):
         findings.notes.append("all actions lie within the inner half of their bounds: is the scale right?")
-    return np.clip(lowest, low, high), np.clip(highest, low, high)
+    return ActionRange(np.clip(lowest, low, high), np.clip(highest, low, high), low, high)
 
 
 def check_observations(summary: ColumnSummary, is_integer: bool, findings: Findings) -> None:

@@ -30,6 +30,8 @@ class ReadOptions:
     :param action_low: smallest allowed action, a number or one per entry, default -1. Actions are kept in these units; the
         replay buffer scales them to [-1, 1].
     :param action_high: largest allowed action, a number or one per entry, default 1
+    :param action_scale: in place of the two: ``"data"`` takes the smallest and the largest action found, per entry, and a
+        number x takes [-x, x]
     :param clip_actions: move actions outside of the bounds onto them; without it they are an error if they are outside by
         more than 1 % of half the range
     :param drop_nonfinite: leave out transitions with NaN or infinity; without it they are an error
@@ -42,6 +44,7 @@ class ReadOptions:
     act_dim: int | None = None
     action_low: Any = None
     action_high: Any = None
+    action_scale: str | float | None = None
     clip_actions: bool = False
     drop_nonfinite: bool = False
     max_bytes: int = DEFAULT_MAX_BYTES
@@ -54,14 +57,41 @@ class ReadOptions:
                     f"must be at least 1, got {value}", where=name, hint="Leave it out for the default", key=name
                 )
 
-    def action_bounds(self, act_dim: int) -> tuple[np.ndarray, np.ndarray]:
+        if self.action_scale is None:
+            return
+        if self.action_low is not None or self.action_high is not None:
+            raise ConfigError(
+                "action_scale and action_low/action_high say the same thing twice",
+                key="action_scale",
+                hint="Give the bounds of the action space, or the rule, not both",
+            )
+        number = isinstance(self.action_scale, int | float) and not isinstance(self.action_scale, bool)
+        if not (self.action_scale == "data" or (number and 0 < float(self.action_scale) < float("inf"))):
+            raise ConfigError(
+                f"action_scale must be 'data' or a number above 0, got {self.action_scale!r}",
+                key="action_scale",
+                hint="100.0 means actions in [-100, 100]",
+            )
+
+    def action_bounds(
+        self, act_dim: int, lowest: np.ndarray | None = None, highest: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """
-        Bounds of each entry of an action.
+        Bounds of each entry of an action, the space that a policy's actions span.
 
         :param act_dim: number of entries
+        :param lowest: smallest action found, shape (act_dim,), for ``action_scale="data"``
+        :param highest: largest action found, shape (act_dim,)
         :return: low and high, float32, shape (act_dim,)
         :raises ConfigError: if they do not fit the width, are not finite, or low is not below high
         """
+        if self.action_scale == "data":
+            assert lowest is not None and highest is not None
+            constant = lowest == highest  # an entry that never changes still needs an interval
+            return (lowest - constant).astype(np.float32), (highest + constant).astype(np.float32)
+        if self.action_scale is not None:
+            bound = np.full(act_dim, self.action_scale, dtype=np.float32)
+            return -bound, bound
         given = (-1.0 if self.action_low is None else self.action_low, 1.0 if self.action_high is None else self.action_high)
         try:
             low, high = (np.broadcast_to(np.asarray(bound, dtype=np.float32), (act_dim,)) for bound in given)
@@ -102,6 +132,8 @@ class DatasetInfo:
     :param reward_max: largest of these rewards
     :param action_low: smallest action found, shape (act_dim,)
     :param action_high: largest action found, shape (act_dim,)
+    :param action_space_low: bounds of the actions, -1 unless the reader was told otherwise, shape (act_dim,)
+    :param action_space_high: bounds of the actions, shape (act_dim,)
     :param notes: things worth knowing
     :param warnings: things that deserve a look, each also issued as a ``DatasetWarning``
     """
@@ -125,6 +157,8 @@ class DatasetInfo:
     reward_max: float
     action_low: np.ndarray
     action_high: np.ndarray
+    action_space_low: np.ndarray
+    action_space_high: np.ndarray
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     _file_state: tuple[int, int] | None = field(default=None, init=False, repr=False)
