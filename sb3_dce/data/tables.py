@@ -1,8 +1,8 @@
 """
 Tables, one row per step: CSV, Parquet and pandas data frames. Columns are found by name, or given by the user.
 
-Numbers of a CSV file are read with Python's own parser: pandas takes ``True`` for 1.0, a surplus first column for an index,
-and does not say in which line a bad cell is.
+A CSV file that is not plain is read with Python's own parser: pandas pads short lines, takes a surplus first column for an
+index, and does not say in which line a bad cell is.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from sb3_dce.data.file_checks import translated_errors
 from sb3_dce.data.hdf5 import DEFAULT_MAX_BYTES
 from sb3_dce.data.layout import CORE_KEYS, MATRIX_KEYS, REQUIRED_KEYS
 from sb3_dce.data.locate import require_file
+from sb3_dce.data.plain_csv import numbers_of, read_plain, without_word
 from sb3_dce.errors import (
     ConfigError,
     DatasetFormatError,
@@ -48,7 +49,6 @@ NAMES = {
 AMBIGUOUS_NAMES = ("done", "dones")
 _WANTED = "Columns are called obs_0, obs_1, ..., action_0, ..., reward, terminal, and optionally timeout and next_obs_0, ..."
 _KEY_OF_NAME = {name: key for key, names in NAMES.items() for name in names}
-_FLAG_WORDS = {"false": "0", "true": "1"}
 _BYTES_PER_CELL = 8
 
 
@@ -268,6 +268,13 @@ class _Records:
         self._reader = reader
         self.line = 1
 
+    @property
+    def lines_read(self) -> int:
+        """
+        :return: lines up to the end of the last record
+        """
+        return int(self._reader.line_num)
+
     def __iter__(self) -> Iterator[list[str]]:
         while True:
             self.line = self._reader.line_num + 1
@@ -286,7 +293,7 @@ def _read_csv(records: _Records, columns: Columns | None, path: Path, sep: str) 
 
 
 def _split(records: _Records, columns: Columns | None, path: Path, sep: str) -> dict[str, np.ndarray]:
-    """Read all records into one flat array, then cut it into columns."""
+    """Read all numbers into one matrix, then cut it into columns."""
     rows = iter(records)
     names = next(rows, [])
     other = next((mark for mark in (",", ";", "\t") if mark != sep and len(names) == 1 and mark in names[0]), None)
@@ -296,6 +303,20 @@ def _split(records: _Records, columns: Columns | None, path: Path, sep: str) -> 
         )
     found = _find_columns(names, columns, f"{path}, line 1")
     cells_of_keys = [(key, i) for key, positions in found.items() for i in positions]
+    cells = [i for _, i in cells_of_keys]
+    flags = [n for n, (key, _) in enumerate(cells_of_keys) if key in FLAG_KEYS]
+    matrix = read_plain(path, sep, records.lines_read, len(names), cells, flags)
+    if matrix is None:
+        matrix = _by_record(rows, records, names, cells_of_keys, path)
+    edges = np.cumsum([len(chosen) for chosen in found.values()])[:-1]
+    parts = dict(zip(found, np.split(matrix, edges, axis=1), strict=True))
+    return {key: part if key in MATRIX_KEYS else part[:, 0] for key, part in parts.items()}
+
+
+def _by_record(
+    rows: Iterable[list[str]], records: _Records, names: Sequence[str], cells_of_keys: Sequence[tuple[str, int]], path: Path
+) -> np.ndarray:
+    """Numbers of the wanted cells, shape (rows, cells), read one record after the other."""
     flags = [n for n, (key, _) in enumerate(cells_of_keys) if key in FLAG_KEYS]
     pick = itemgetter(*(i for _, i in cells_of_keys))
     values = array("d")
@@ -307,28 +328,14 @@ def _split(records: _Records, columns: Columns | None, path: Path, sep: str) -> 
             )
         cells = list(pick(record))
         for n in flags:
-            cells[n] = _FLAG_WORDS.get(cells[n].lower(), cells[n])
-        numbers = _parsed(cells)
+            cells[n] = without_word(cells[n])
+        numbers = numbers_of(cells)
         if numbers is None or any(numbers[n] not in (0.0, 1.0) for n in flags):
             raise _bad_cell(record, names, cells_of_keys, _Line(path, records.line))
         values.extend(numbers)
     if not values:
         raise _Line(path, 2).fault("no line of data", "Record some steps first")
-    matrix = np.frombuffer(values).reshape(-1, len(cells_of_keys))
-    edges = np.cumsum([len(chosen) for chosen in found.values()])[:-1]
-    parts = dict(zip(found, np.split(matrix, edges, axis=1), strict=True))
-    return {key: part if key in MATRIX_KEYS else part[:, 0] for key, part in parts.items()}
-
-
-def _parsed(cells: Sequence[str]) -> list[float] | None:
-    """Numbers of the cells; None if one is none, or is written in a way that only Python takes for a number."""
-    text = "".join(cells)
-    if "_" in text or "\n" in text or "\r" in text or not text.isascii():
-        return None
-    try:
-        return list(map(float, cells))
-    except ValueError:
-        return None
+    return np.frombuffer(values).reshape(-1, len(cells_of_keys))
 
 
 def _bad_cell(
@@ -352,8 +359,8 @@ def _bad_cell(
 
 def _is_good(cell: str, key: str) -> bool:
     if key not in FLAG_KEYS:
-        return _parsed([cell]) is not None
-    return _parsed([_FLAG_WORDS.get(cell.lower(), cell)]) in ([0.0], [1.0])
+        return numbers_of([cell]) is not None
+    return numbers_of([without_word(cell)]) in ([0.0], [1.0])
 
 
 def _check_size(size: int, max_bytes: int, path: Path) -> None:
