@@ -1,19 +1,35 @@
-"""The command line of data: ``sb3-dce datasets list | info | download``."""
+"""The command line of data: ``sb3-dce datasets list | info | check | report | download``."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
+
+if TYPE_CHECKING:
+    from sb3_dce.data.advice import Check
 
 app = typer.Typer(help="What data there are, and what is in them.", no_args_is_help=True)
 
 console = Console(highlight=False)
 DatasetArgument = Annotated[str, typer.Argument(help="Id such as [b]walker2d-medium[/b], or an HDF5 file in D4RL layout.")]
+BetaOption = Annotated[
+    float | None, typer.Option(show_default=False, help="Penalty weight of the survival condition; default: the dataset's row.")
+]
+ActionLowOption = Annotated[float | None, typer.Option(show_default=False, help="Smallest allowed action; default -1.")]
+ActionHighOption = Annotated[float | None, typer.Option(show_default=False, help="Largest allowed action; default 1.")]
+MaxEpisodeStepsOption = Annotated[
+    int | None, typer.Option(min=1, show_default=False, help="Time limit of the environment; default: the catalogue's.")
+]
+ClipActionsOption = Annotated[bool, typer.Option("--clip-actions", help="Move actions outside of their bounds onto them.")]
+DropNonfiniteOption = Annotated[bool, typer.Option("--drop-nonfinite", help="Leave out rows with NaN or infinity.")]
+D4RLCompatOption = Annotated[bool, typer.Option("--d4rl-compat", help="Use the rows of D4RL's qlearning_dataset.")]
 
 
 @app.command("list")
@@ -31,7 +47,7 @@ def list_datasets(
     for spec in all_specs():
         if spec.id in here or all_:
             where = "comes with the package" if spec.embedded else str(here.get(spec.id, "not on this machine"))
-            table.add_row(spec.id, spec.env_id, str(spec.obs_dim), str(spec.act_dim), where)
+            table.add_row(spec.id, spec.env_id or "none today", str(spec.obs_dim), str(spec.act_dim), where)
     console.print(table)
     if not all_:
         console.print(f"[dim]--all shows the others. Put files into a folder named in ${DATASETS_VARIABLE}.[/dim]")
@@ -48,6 +64,102 @@ def dataset_info(dataset: DatasetArgument) -> None:
     for line in transitions.summary():
         console.print(line, markup=False)
     console.print(f"sha256 {transitions.info.sha256}")
+
+
+@app.command("check")
+def check_dataset(
+    dataset: DatasetArgument,
+    json_: Annotated[bool, typer.Option("--json", help="Print one JSON object for programs.")] = False,
+    beta: BetaOption = None,
+    action_low: ActionLowOption = None,
+    action_high: ActionHighOption = None,
+    max_episode_steps: MaxEpisodeStepsOption = None,
+    clip_actions: ClipActionsOption = False,
+    drop_nonfinite: DropNonfiniteOption = False,
+    d4rl_compat: D4RLCompatOption = False,
+) -> None:
+    """
+    Read a dataset with every check, and say of each what, how many, where, and what to do.
+
+    Verdicts are ok, note, warning and error. The exit code is that of the worst: 0 for ok and notes, 1 for warnings, 2 if
+    the data cannot be used (the reason is on stderr).
+    """
+    import json
+
+    from sb3_dce.data.advice import EXIT_CODES, examine
+
+    examination = examine(
+        dataset,
+        beta=beta,
+        action_low=action_low,
+        action_high=action_high,
+        max_episode_steps=max_episode_steps,
+        clip_actions=clip_actions,
+        drop_nonfinite=drop_nonfinite,
+        d4rl_compat=d4rl_compat,
+    )
+    if json_:
+        typer.echo(json.dumps(examination.as_dict(), indent=2))
+    else:
+        _print_checks(examination.checks)
+    if examination.error is not None:
+        raise examination.error
+    raise typer.Exit(EXIT_CODES[examination.verdict])
+
+
+@app.command("report")
+def report_dataset(
+    dataset: DatasetArgument,
+    out: Annotated[
+        Path | None, typer.Option(show_default=False, help="File to write; default <name>-report.html in this folder.")
+    ] = None,
+    force: Annotated[bool, typer.Option(help="Replace the file even if it is not a report.")] = False,
+    beta: BetaOption = None,
+    action_low: ActionLowOption = None,
+    action_high: ActionHighOption = None,
+    max_episode_steps: MaxEpisodeStepsOption = None,
+    clip_actions: ClipActionsOption = False,
+    drop_nonfinite: DropNonfiniteOption = False,
+    d4rl_compat: D4RLCompatOption = False,
+) -> None:
+    """
+    Write one HTML page about a dataset: which parameters it asks for and why, plots, and every check.
+
+    The page needs no network and no other file. A file that is not such a report is replaced only with --force.
+    """
+    from sb3_dce.report import write_report
+
+    path, examination = write_report(
+        dataset,
+        out,
+        force=force,
+        beta=beta,
+        action_low=action_low,
+        action_high=action_high,
+        max_episode_steps=max_episode_steps,
+        clip_actions=clip_actions,
+        drop_nonfinite=drop_nonfinite,
+        d4rl_compat=d4rl_compat,
+    )
+    _print_checks([check for check in examination.checks if check.verdict != "ok"])
+    console.print(f"report {path}", markup=False)
+
+
+def _print_checks(checks: Iterable[Check]) -> None:
+    colors = {"ok": "green", "note": "cyan", "warning": "yellow", "error": "bold red"}
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for check in checks:
+        lines = [Text(check.what)]
+        # A count that opens the text needs no second mention.
+        if check.count is not None and not check.what.startswith(str(check.count)):
+            lines[0].append(f" (number: {check.count:,})")
+        lines += [Text(f"where: {check.where}")] if check.where else []
+        lines += [Text(f"remedy: {check.remedy}", style="dim")] if check.remedy else []
+        table.add_row(Text(check.verdict, style=colors[check.verdict]), check.name, Text("\n").join(lines))
+    console.print(table)
 
 
 @app.command("download")

@@ -12,7 +12,7 @@ import contextlib
 import importlib
 import io
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -108,13 +108,10 @@ def make_dataset_env(dataset_id: str, render_mode: str | None = None, spaces_onl
     spec = catalog.resolve(dataset_id)
     if spaces_only:
         return SpacesEnv(*dataset_spaces(spec))
-    package = missing_package(spec)
-    if package is not None:
-        raise ConfigError(
-            f"the environment of {spec.id!r} needs the package {package!r}",
-            key=package,
-            hint=f"Install it with: {INSTALL_COMMANDS[package]}",
-        )
+    missing = missing_simulator(spec)
+    if missing is not None:
+        raise ConfigError(missing.reason, where=spec.id, key=missing.package, hint=missing.remedy)
+    assert spec.env_id is not None
     kwargs["render_mode"] = render_mode
     if spec.family == "adroit":
         return fix_adroit(_simulator(spec.env_id, **kwargs))
@@ -133,7 +130,7 @@ def make_env_if_possible(dataset_id: str) -> gym.Env:
     :return: an environment that can be stepped, else a :class:`SpacesEnv`
     """
     spec = catalog.resolve(dataset_id)
-    if missing_package(spec) is not None:
+    if missing_simulator(spec) is not None:
         return SpacesEnv(*dataset_spaces(spec))
     # not gym.make(id): it would call the version 0 sets outdated because there are version 1 sets
     env = gym.spec(spec.id).make()
@@ -141,18 +138,34 @@ def make_env_if_possible(dataset_id: str) -> gym.Env:
     return env
 
 
-def missing_package(spec: DatasetSpec) -> str | None:
+class MissingSimulator(NamedTuple):
+    """Why a policy cannot be evaluated here, and what to do; ``package`` is what could be installed, if anything."""
+
+    reason: str
+    remedy: str
+    package: str | None
+
+
+def missing_simulator(spec: DatasetSpec) -> MissingSimulator | None:
     """
     :param spec: catalogue entry
-    :return: the package without which the environment cannot run, or ``None`` if nothing is missing
+    :return: what the environment lacks to run, or ``None`` if it can
     """
+    if spec.env_id is None:
+        return MissingSimulator(
+            f"no simulator of today matches the data of {spec.id!r}: the mazes of Gymnasium-Robotics are mirrored and "
+            "have another origin",
+            "Train on these data and evaluate in an environment of your own: model.set_env(env).",
+            None,
+        )
     for package in _PACKAGES[spec.family]:
         try:
             # Gymnasium-Robotics announces its reward change at import; fix_adroit undoes that change
             with contextlib.redirect_stderr(io.StringIO()):
                 importlib.import_module(package)
         except ImportError:
-            return package
+            remedy = f"Install it with: {INSTALL_COMMANDS[package]}"
+            return MissingSimulator(f"the environment of {spec.id!r} needs the package {package!r}", remedy, package)
     return None
 
 

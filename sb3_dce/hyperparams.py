@@ -94,7 +94,7 @@ def load_row(algo: str, dataset_id: str | None) -> dict[str, Any]:
     if dataset_id is None:
         return rows["default"]
     spec = catalog.resolve(dataset_id)
-    names = (spec.id, spec.paper_row, "default")
+    names = (spec.id, spec.paper_row or spec.id, "default")
     for name in names:
         if name in rows:
             return {**rows[name], "dataset": spec.id}

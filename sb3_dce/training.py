@@ -15,6 +15,7 @@ from sb3_dce.agents import agent_class
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.data import find_file
 from sb3_dce.data.catalog import resolve
+from sb3_dce.envs import missing_simulator
 from sb3_dce.errors import CheckpointError, ConfigError
 from sb3_dce.evaluation import Evaluation, catalogue_id, evaluate, make_eval_env, read_evaluations
 from sb3_dce.launch import launch
@@ -111,13 +112,11 @@ def evaluate_file(model_path: Path, dataset: str | None, n_episodes: int, seed: 
             key="dataset",
             hint="Name one with --dataset, for example --dataset halfcheetah-medium.",
         )
+    missing = missing_simulator(resolve(dataset_id))
+    if missing is not None:
+        raise ConfigError(missing.reason, key="env", hint=missing.remedy)
     env = make_eval_env(dataset_id, n_episodes)
-    if env is None:
-        raise ConfigError(
-            f"the simulator of {dataset_id} is not installed",
-            key="env",
-            hint='Install it: pip install mujoco, or pip install "sb3_dce[robotics]" for Adroit and Kitchen.',
-        )
+    assert env is not None
     return evaluate(model, env, n_episodes, seed, dataset_id)
 
 

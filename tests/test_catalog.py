@@ -12,6 +12,7 @@ from sb3_dce.data import all_specs, available, find_file, normalized_score, reso
 from sb3_dce.data.catalog import D4RL_URL
 from sb3_dce.data.locate import cache_folder, is_path
 from sb3_dce.errors import DatasetError, DatasetNotFoundError
+from sb3_dce.hyperparams import load_row
 
 
 @pytest.fixture(autouse=True)
@@ -35,7 +36,7 @@ def test_catalogue_holds_the_papers_datasets_once() -> None:
     assert len(ids) == 23
     known = [spec.id for spec in all_specs()]
     assert len(known) == len(set(known)) and set(ids) <= set(known)
-    assert {spec.paper_row for spec in all_specs()} == set(ids)
+    assert {spec.paper_row for spec in all_specs() if spec.family != "antmaze"} == set(ids)
     assert all(resolve(dataset_id).paper_row == dataset_id for dataset_id in ids)
 
 
@@ -56,6 +57,7 @@ def test_generated_data_never_carry_an_official_id() -> None:
         ("pen-human-v1", "pen-human-v1"),
         ("door-expert", "door-expert-v1"),
         ("kitchen_mixed", "kitchen-mixed-v0"),
+        ("antmaze-umaze", "antmaze-umaze-v2"),
         ("Hopper-Random-v2", "hopper-random-v2"),
         ("halfcheetah-demo-sb3", "halfcheetah-demo-sb3"),
     ],
@@ -76,6 +78,7 @@ def test_unknown_name_lists_close_matches() -> None:
         ("halfcheetah-medium-v2.hdf5", "halfcheetah-medium-v2"),
         ("pen-v0_demos_clipped.hdf5", "pen-human-v0"),
         ("halfcheetah-medium-sb3.hdf5", "halfcheetah-medium-sb3"),
+        ("Ant_maze_big-maze_noisy_multistart_True_multigoal_False_sparse_fixed.hdf5", "antmaze-medium-play-v2"),
         ("mine.hdf5", None),
     ],
 )
@@ -155,3 +158,13 @@ def test_embedded_files_need_no_folder() -> None:
     path, spec = find_file("halfcheetah-tiny-sb3")
     assert spec is not None and spec.embedded and h5py.is_hdf5(path)
     assert {"halfcheetah-tiny-sb3", "halfcheetah-demo-sb3"} == {spec.id for spec, _ in available()}
+
+
+def test_antmaze_has_scores_but_no_row_of_the_paper_and_no_simulator() -> None:
+    specs = [spec for spec in all_specs() if spec.family == "antmaze"]
+    assert len(specs) == 12 and len({spec.file_name for spec in specs}) == 12
+    assert normalized_score("antmaze-large-diverse", [0.0, 1.0]).tolist() == [0.0, 100.0]
+    assert all((spec.paper_row, spec.env_id, spec.obs_dim, spec.act_dim) == (None, None, 29, 8) for spec in specs)
+    umaze = [spec.max_episode_steps for spec in specs if "umaze" in spec.id]
+    assert umaze == [700] * 4 and {spec.max_episode_steps for spec in specs if "umaze" not in spec.id} == {1000}
+    assert load_row("dce", "antmaze-umaze")["dataset"] == "antmaze-umaze-v2"

@@ -116,6 +116,13 @@ def test_without_simulator_making_fails_with_the_command_and_spaces_remain(monke
     assert isinstance(envs.make_env_if_possible("halfcheetah-medium-v2"), envs.SpacesEnv)
 
 
+def test_antmaze_can_be_trained_on_but_not_evaluated() -> None:
+    env = envs.make_env_if_possible("antmaze-umaze-v2")
+    assert isinstance(env, envs.SpacesEnv) and env.observation_space.shape == (29,)
+    with pytest.raises(ConfigError, match="mirrored"):
+        envs.make_dataset_env("antmaze-umaze-v2")
+
+
 def test_missing_robotics_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gymnasium_robotics", None)
     with pytest.raises(ConfigError, match=r'pip install "sb3_dce\[robotics\]"'):

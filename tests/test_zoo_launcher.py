@@ -71,7 +71,7 @@ REFUSALS = {
     "evaluation without simulator": Refusal(
         TRAIN, "mujoco", 'pip install "gymnasium[mujoco]" - or train without evaluation: --eval-freq -1'
     ),
-    "search without simulator": Refusal([*TRAIN, "-optimize", *NO_EVALUATION], "mujoco", "the package 'mujoco' is missing"),
+    "search without simulator": Refusal([*TRAIN, "-optimize", *NO_EVALUATION], "mujoco", "needs the package 'mujoco'"),
     "dataset file missing": Refusal(
         ["train", "--algo", "dce", "--env", "kitchen-mixed-v0", *NO_EVALUATION],
         "gymnasium_robotics",

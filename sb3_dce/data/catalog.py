@@ -19,7 +19,7 @@ import numpy as np
 
 from sb3_dce.errors import DatasetError
 
-Family = Literal["gym", "adroit", "kitchen"]
+Family = Literal["gym", "adroit", "kitchen", "antmaze"]
 
 D4RL_URL = "http://rail.eecs.berkeley.edu/datasets/offline_rl/"
 
@@ -38,7 +38,7 @@ class DatasetSpec:
 
     :param id: name used everywhere, e.g. ``halfcheetah-medium-v2``
     :param family: group of environments the dataset belongs to
-    :param env_id: id of the simulator in which a policy is evaluated
+    :param env_id: id of the simulator in which a policy is evaluated; None where none of today's matches the data
     :param max_episode_steps: time limit of that environment, steps
     :param obs_dim: number of entries of an observation
     :param act_dim: number of entries of an action
@@ -48,14 +48,14 @@ class DatasetSpec:
     :param url: where D4RL publishes the file; None for data made with this package
     :param sha256: hash of the file, only for files that come with the package
     :param paper_row: D4RL id whose hyperparameters apply: the id itself, the v0 id of an Adroit v1 set, the set a ``-sb3``
-        set stands in for, and the nearest set for the expert sets, which are outside the paper
+        set stands in for, and the nearest set for the expert sets, which are outside the paper; None for AntMaze
     :param generated: True for data made with this package
     :param embedded: True if the file comes with the package
     """
 
     id: str
     family: Family
-    env_id: str
+    env_id: str | None
     max_episode_steps: int
     obs_dim: int
     act_dim: int
@@ -64,7 +64,7 @@ class DatasetSpec:
     file_name: str
     url: str | None
     sha256: str | None
-    paper_row: str
+    paper_row: str | None
     generated: bool = False
     embedded: bool = False
 
@@ -74,7 +74,7 @@ class _Task:
     """The fields that all datasets of one task share; the order is that of :class:`DatasetSpec`."""
 
     family: Family
-    env_id: str
+    env_id: str | None
     max_episode_steps: int
     obs_dim: int
     act_dim: int
@@ -90,6 +90,10 @@ _TASKS = {
     "hammer": _Task("adroit", "AdroitHandHammer-v1", 200, 46, 26, -274.856578, 12794.134825156867),
     "door": _Task("adroit", "AdroitHandDoor-v1", 200, 39, 28, -56.512833, 2880.5693087298737),
     "relocate": _Task("adroit", "AdroitHandRelocate-v1", 200, 39, 30, -6.425911, 4233.877797728884),
+    # The mazes of Gymnasium-Robotics have the y axis turned round and another origin than those of the data.
+    "antmaze-umaze": _Task("antmaze", None, 700, 29, 8, 0.0, 1.0),
+    "antmaze-medium": _Task("antmaze", None, 1000, 29, 8, 0.0, 1.0),
+    "antmaze-large": _Task("antmaze", None, 1000, 29, 8, 0.0, 1.0),
     "kitchen": _Task("kitchen", "FrankaKitchen-v1", 280, 60, 9, 0.0, 4.0),
 }
 
@@ -161,7 +165,8 @@ def _spec(dataset_id: str, task: str, **fields: Any) -> DatasetSpec:
 def _official(dataset_id: str, task: str, path: str, paper_row: str | None = None) -> DatasetSpec:
     """A set published by D4RL at ``path`` below :data:`D4RL_URL`."""
     file_name = path.rpartition("/")[2]
-    return _spec(dataset_id, task, file_name=file_name, url=D4RL_URL + path, sha256=None, paper_row=paper_row or dataset_id)
+    row = None if _TASKS[task].family == "antmaze" else paper_row or dataset_id
+    return _spec(dataset_id, task, file_name=file_name, url=D4RL_URL + path, sha256=None, paper_row=row)
 
 
 def _generated(dataset_id: str, paper_row: str) -> DatasetSpec:
@@ -204,6 +209,17 @@ def _kitchen_specs() -> Iterator[DatasetSpec]:
     yield _official("kitchen-mixed-v0", "kitchen", "kitchen/kitchen_microwave_kettle_bottomburner_light-v0.hdf5")
 
 
+def _antmaze_specs() -> Iterator[DatasetSpec]:
+    """D4RL AntMaze, outside the paper; v2 mends the timeouts of v0."""
+    mazes = {"umaze": "u-maze", "medium": "big-maze", "large": "hardest-maze"}
+    for version, folder, suffix in (("v2", "ant_maze_v2", "_fixed"), ("v0", "ant_maze_new", "")):
+        for size, maze in mazes.items():
+            for kind in ("", "-diverse") if size == "umaze" else ("-play", "-diverse"):
+                starts, goals = kind != "", kind == "-diverse"
+                file_name = f"Ant_maze_{maze}_noisy_multistart_{starts}_multigoal_{goals}_sparse{suffix}.hdf5"
+                yield _official(f"antmaze-{size}{kind}-{version}", f"antmaze-{size}", f"{folder}/{file_name}")
+
+
 def _generated_specs() -> Iterator[DatasetSpec]:
     """Sets made with this package, the two embedded ones first."""
     for dataset_id in _EMBEDDED_SHA256:
@@ -218,4 +234,5 @@ def _generated_specs() -> Iterator[DatasetSpec]:
     yield _generated("door-human-replayed-sb3", "door-human-v0")
 
 
-_SPECS = {spec.id: spec for specs in (_gym_specs, _adroit_specs, _kitchen_specs, _generated_specs) for spec in specs()}
+_TABLES = (_gym_specs, _adroit_specs, _kitchen_specs, _antmaze_specs, _generated_specs)
+_SPECS = {spec.id: spec for specs in _TABLES for spec in specs()}

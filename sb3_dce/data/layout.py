@@ -252,7 +252,7 @@ def _check_widths(
     widths = {key: _width(sources[key]) for key in MATRIX_KEYS if key in sources}
     bad = {key: width for key, width in widths.items() if width == 0 or width != (expected[key] or width)}
     if bad:
-        owner = f" by {spec.env_id}" if spec else ""
+        owner = f" by {spec.env_id or spec.id}" if spec else ""
         hint = "Use the file of that environment, or pass obs_dim= and act_dim="
         if spec and spec.family == "kitchen" and widths["observations"] == 59:
             hint = "59 entries are FrankaKitchen-v1's own: D4RL's 60 are [obs[0:9], obs[18:39], goal (30)]"

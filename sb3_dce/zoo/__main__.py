@@ -118,14 +118,14 @@ def _prepare_training(options: argparse.Namespace, arguments: list[str], cleanup
 
 def _check_simulator(options: argparse.Namespace) -> None:
     """Without the simulator only training works; an evaluation would stop it hours later."""
-    package = envs.missing_package(catalog.resolve(options.env))
-    if package is None:
+    missing = envs.missing_simulator(catalog.resolve(options.env))
+    if missing is None:
         return
     if options.optimize_hyperparameters or options.eval_freq > 0:
         raise ConfigError(
-            f"{options.env} cannot be evaluated: the package {package!r} is missing",
+            f"{options.env} cannot be evaluated: {missing.reason}",
             where="--eval-freq",
-            hint=f"Install it with: {envs.INSTALL_COMMANDS[package]} - or train without evaluation: --eval-freq -1",
+            hint=f"{missing.remedy} - or train without evaluation: --eval-freq -1",
         )
     envs.use_spaces_only(options.env)
 
