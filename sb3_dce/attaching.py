@@ -21,7 +21,8 @@ from sb3_dce.buffers import OfflineReplayBuffer
 from sb3_dce.data import Transitions, find_file, load_transitions
 from sb3_dce.data.catalog import DatasetSpec, resolve
 from sb3_dce.data.locate import is_path
-from sb3_dce.envs import SpacesEnv, dataset_spaces, make_env_if_possible
+from sb3_dce.data.minari import is_minari_name
+from sb3_dce.envs import SpacesEnv, dataset_spaces, make_env_if_possible, make_minari_env
 from sb3_dce.errors import ConfigError, DatasetSemanticsError, DatasetWarning
 from sb3_dce.networks import StandardizedExtractor
 
@@ -56,7 +57,7 @@ class AttachingMixin(OffPolicyAlgorithm):
 
         ``OfflineDCE.load_dataset("walker2d-medium").learn(1e6)`` is the shortest way to a trained agent.
 
-        :param name: catalogue id, embedded id, path of an HDF5 file, or ``Transitions``
+        :param name: catalogue id, embedded id, ``minari:`` and an id of Minari, path of a file, or ``Transitions``
         :param env: environment for evaluation; ``None`` makes the dataset's own if its simulator is installed
         :param policy: policy name or class; ``None`` takes that of the row
         :param overrides: constructor arguments that replace those of the row
@@ -73,6 +74,8 @@ class AttachingMixin(OffPolicyAlgorithm):
         arguments["policy"] = policy or arguments.get("policy", "MlpPolicy")
         if env is None and spec is not None:
             env = make_env_if_possible(spec.id)
+        elif env is None and is_minari_name(name):
+            env = make_minari_env(name)
         return cls(env=env, **arguments)  # type: ignore[arg-type]
 
     def set_dataset(self, dataset: DatasetLike) -> None:
@@ -104,6 +107,10 @@ class AttachingMixin(OffPolicyAlgorithm):
             path, spec = find_file(dataset)
             self.dataset = str(path.resolve())  # a relative path would be lost after a change of folder
             return spec
+        if is_minari_name(dataset):
+            find_file(dataset)  # it need not be known, but here
+            self.dataset = os.fspath(dataset)
+            return None
         spec = resolve(os.fspath(dataset))
         self.dataset = spec.id
         return spec

@@ -22,6 +22,7 @@ from gymnasium.wrappers.utils import create_zero_array
 
 from sb3_dce.data import catalog
 from sb3_dce.data.catalog import DatasetSpec
+from sb3_dce.data.minari import environment_spec, find_minari
 from sb3_dce.errors import ConfigError
 from sb3_dce.robotics import KITCHEN_ROBOT_NOISE_RATIO, KitchenObservation, fix_adroit, fix_kitchen_joint_types, kitchen_tasks
 
@@ -144,6 +145,33 @@ class MissingSimulator(NamedTuple):
     reason: str
     remedy: str
     package: str | None
+
+
+def make_minari_env(name: str) -> gym.Env | None:
+    """
+    Environment of a dataset of Minari: the one that Gymnasium itself knows by the id in the metadata. They may also name
+    code, arguments and wrappers; nothing of this is used, and where it differs from Gymnasium's own entry there is none.
+
+    :param name: ``minari:`` and an id of Minari
+    :return: an environment that can be stepped, or ``None``
+    """
+    recorded = environment_spec(find_minari(name))
+    env_id = recorded.get("id", "")
+    is_adroit = env_id.startswith("AdroitHand")
+    if is_adroit:
+        # Gymnasium-Robotics announces its reward change at import
+        with contextlib.suppress(ImportError), contextlib.redirect_stderr(io.StringIO()):
+            importlib.import_module("gymnasium_robotics")
+    known = gym.registry.get(env_id)
+    if known is None or recorded.get("kwargs", {}) != known.kwargs or recorded.get("additional_wrappers"):
+        return None
+    try:
+        with _quiet_model_compiler() if is_adroit else contextlib.nullcontext():
+            env = gym.make(env_id)
+    except (gym.error.Error, ImportError):  # its simulator is not installed
+        return None
+    assert isinstance(env, gym.Env)
+    return env
 
 
 def missing_simulator(spec: DatasetSpec) -> MissingSimulator | None:

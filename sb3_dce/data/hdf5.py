@@ -1,5 +1,6 @@
 """
-HDF5 files in the layout of D4RL: flat arrays, one row per step. The only importer of h5py.
+HDF5 files in the layout of D4RL (flat arrays, one row per step) and of Minari (a group per episode). The only importer of
+h5py.
 
 A dataset file comes from the internet, so it is treated as hostile. HDF5 can point into other files of the machine (soft and
 external links, external storage, virtual datasets), can load filter plugins, and can declare terabytes in a kilobyte; h5py
@@ -14,7 +15,7 @@ from math import prod
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import h5py
 import numpy as np
@@ -31,6 +32,7 @@ MAX_OBJECTS = 10_000
 # Honest arrays exceed any flat ratio (a million False compress 411:1), so only large ones are judged by it.
 MAX_RATIO = 200
 RATIO_APPLIES_ABOVE = 256 * 2**20
+_File = TypeVar("_File", bound="D4RLFile")
 
 
 class HDF5Array:
@@ -72,13 +74,15 @@ class D4RLFile:
     :param url: where the file can be downloaded again, for messages
     """
 
+    _layout_hint = "D4RL's layout is flat, one array per key, one row per step"
+
     def __init__(self, path: str | PathLike[str], *, max_bytes: int = DEFAULT_MAX_BYTES, url: str | None = None) -> None:
         self.path = Path(path)
         self.max_bytes = max_bytes
         self._again = f"Download it again: {url}" if url else "Download or copy it again"
         self.keys: tuple[str, ...] = ()
 
-    def __enter__(self) -> D4RLFile:
+    def __enter__(self: _File) -> _File:
         head = read_head(self.path)
         with translated_errors(self.path, hint=self._again):
             self._stat = os.stat(self.path)
@@ -88,7 +92,7 @@ class D4RLFile:
                 raise not_hdf5(self.path, head, self._again) from exc
         try:
             with translated_errors(self.path, hint=self._again):
-                self.keys = tuple(_walk(self._file, self.path))
+                self.keys = tuple(self._checked_names())
         except BaseException:
             self._file.close()
             raise
@@ -128,13 +132,14 @@ class D4RLFile:
         :raises DatasetSecurityError: if an array lies in another file, needs a filter that is not built in, or is too large
         """
         with translated_errors(self.path):
-            chosen = {name: self._file[name] for name in names if name in self._file}
+            found = {name: self._find(name) for name in names}
+            chosen = {name: item for name, item in found.items() if item is not None}
             groups = [name for name, item in chosen.items() if not isinstance(item, h5py.Dataset)]
             if groups:
                 raise DatasetFormatError(
                     f"{', '.join(groups)} should be an array but is a group or a type",
                     where=str(self.path),
-                    hint="D4RL's layout is flat, one array per key, one row per step",
+                    hint=self._layout_hint,
                     path=self.path,
                     key=groups[0],
                 )
@@ -142,6 +147,13 @@ class D4RLFile:
                 _check_storage(dataset, name, self.path)
             self._check_size(chosen)
         return {name: HDF5Array(dataset, self.path) for name, dataset in chosen.items()}
+
+    def _checked_names(self) -> Iterator[str]:
+        """Names in the file, after checking that each link on the way to them is a hard one."""
+        return _walk(self._file, self.path)
+
+    def _find(self, name: str) -> Any:
+        return self._file[name] if name in self._file else None
 
     def _check_size(self, chosen: Mapping[str, h5py.Dataset]) -> None:
         declared = {name: _declared_bytes(dataset) for name, dataset in chosen.items() if dataset.shape}
@@ -167,6 +179,31 @@ class D4RLFile:
                     path=self.path,
                     key=name,
                 )
+
+
+class EpisodeFile(D4RLFile):
+    """
+    An HDF5 file in Minari's layout: a group per episode with arrays, or groups of arrays, in it.
+
+    The links of the root are checked at once, the others on the way to each array that :meth:`select` is asked for, by a path
+    such as ``episode_0/rewards``: a million steps make some hundred thousand objects, most of which are never read.
+    """
+
+    _layout_hint = "metadata.json of the dataset says that it is an array"
+
+    def _checked_names(self) -> Iterator[str]:
+        for name in self._file:
+            _check_link(self._file.get(name, getlink=True), name, self.path)
+            yield name
+
+    def _find(self, name: str) -> Any:
+        item = self._file
+        for part in name.split("/"):
+            if not isinstance(item, h5py.Group) or not item.id.links.exists(part.encode()):
+                return None
+            _check_link(item.get(part, getlink=True), name, self.path)
+            item = item[part]
+        return item
 
 
 def write_hdf5(

@@ -204,8 +204,8 @@ def _check_keys(sources: Mapping[str, ArraySource], where: str, found: list[str]
     hint = f"Rename {', '.join(near)}" if near else "Rename or add them"
     if any(name in ("terminations", "truncations") or name.startswith("episode_") for name in found):
         hint += (
-            ". This looks like Minari: use from_minari where there is one, or stack the episodes (observations[:-1] and "
-            "observations[1:]) and call Transitions.from_arrays"
+            ". This looks like Minari: Transitions.from_minari reads the folder of a dataset; a file alone needs its "
+            "metadata.json beside it"
         )
     shown = ", ".join(found[:20]) or "none"
     raise DatasetFormatError(

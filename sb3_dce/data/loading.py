@@ -10,6 +10,7 @@ from typing import Any
 from sb3_dce.data.hash_record import verify_record
 from sb3_dce.data.layout import CORE_KEYS
 from sb3_dce.data.locate import find_file
+from sb3_dce.data.minari import folder_of, is_minari_name
 from sb3_dce.data.transitions import Transitions
 from sb3_dce.errors import ConfigError
 
@@ -25,8 +26,8 @@ def load_transitions(name_or_path: str | PathLike[str], **options: Any) -> Trans
     """
     Find a dataset on this machine and read it. Nothing is downloaded.
 
-    :param name_or_path: id or alias of the catalogue, or a file: NPZ, CSV and Parquet by suffix, any other is taken
-        for HDF5 in D4RL's layout
+    :param name_or_path: id or alias of the catalogue; ``minari:`` and an id of Minari, or the folder of such a dataset; or a
+        file: NPZ, CSV and Parquet by suffix, any other is taken for HDF5 in D4RL's layout
     :param options: fields of :class:`~sb3_dce.data.records.ReadOptions`, e.g. ``d4rl_compat=True``, and of the reader
         of this suffix, e.g. ``sep=";"`` (see the class methods of :class:`~sb3_dce.data.transitions.Transitions`)
     :return: the dataset
@@ -34,6 +35,8 @@ def load_transitions(name_or_path: str | PathLike[str], **options: Any) -> Trans
     :raises DatasetIntegrityError: if the file is not the one that was downloaded
     :raises DatasetError: if something is wrong with the dataset
     """
+    if is_minari_name(name_or_path) or folder_of(name_or_path) is not None:
+        return Transitions.from_minari(name_or_path, **options)
     path, spec = find_file(name_or_path)
     verify_record(path)
     read = _READERS.get(path.suffix.lower(), Transitions.from_hdf5)

@@ -14,6 +14,7 @@ from os import PathLike
 from pathlib import Path
 
 from sb3_dce.data.catalog import DatasetSpec, all_specs, resolve, spec_of_file
+from sb3_dce.data.minari import find_minari, is_minari_name
 from sb3_dce.errors import DatasetError, DatasetFormatError, DatasetNotFoundError
 
 DATASETS_VARIABLE = "SB3_DCE_DATASETS"
@@ -24,13 +25,15 @@ def find_file(name_or_path: str | PathLike[str]) -> tuple[Path, DatasetSpec | No
     """
     The file of a dataset.
 
-    A path (see :func:`is_path`) wins over a name. A D4RL id is never answered with a ``-sb3`` file.
+    A path (see :func:`is_path`) wins over a name. A D4RL id is never answered with a ``-sb3`` file, nor with one of Minari.
 
-    :param name_or_path: file, or id or alias of the catalogue
+    :param name_or_path: file, id or alias of the catalogue, or ``minari:`` and an id of Minari
     :return: existing path, and the entry of the catalogue if the name or the file name is known there
     :raises DatasetNotFoundError: if there is no such file; the message says where to put it and what is available
     :raises DatasetError: if it is neither a path nor a known name
     """
+    if is_minari_name(name_or_path):
+        return find_minari(name_or_path).file, None
     path = Path(name_or_path).expanduser()
     if is_path(name_or_path):
         if not path.exists():
@@ -50,6 +53,8 @@ def is_path(name_or_path: str | PathLike[str]) -> bool:
     :param name_or_path: file, or id or alias of the catalogue
     :return: True for a ``Path``, a text with a separator or with the suffix of a dataset (``SUFFIXES``), and any existing file
     """
+    if is_minari_name(name_or_path):
+        return False
     if not isinstance(name_or_path, str) or name_or_path.endswith(SUFFIXES):
         return True
     has_separator = any(separator and separator in name_or_path for separator in (os.sep, os.altsep))
