@@ -36,6 +36,8 @@ class ReadOptions:
         more than 1 % of half the range
     :param drop_nonfinite: leave out transitions with NaN or infinity; without it they are an error
     :param max_bytes: largest size of the arrays of a file, bytes
+    :param cache: keep the finished rows on disk and map them into memory at the next reading of the same file with the same
+        options (168 MB for a million rows of HalfCheetah); default what ``$SB3_DCE_ROW_CACHE`` says, else no
     """
 
     d4rl_compat: bool = False
@@ -48,6 +50,7 @@ class ReadOptions:
     clip_actions: bool = False
     drop_nonfinite: bool = False
     max_bytes: int = DEFAULT_MAX_BYTES
+    cache: bool | None = None
 
     def __post_init__(self) -> None:
         for name in ("max_episode_steps", "obs_dim", "act_dim", "max_bytes"):
@@ -165,7 +168,7 @@ class DatasetInfo:
 
     def __post_init__(self) -> None:
         if self.path is not None:
-            object.__setattr__(self, "_file_state", _file_state(self.path))
+            object.__setattr__(self, "_file_state", file_state(self.path))
 
     @cached_property
     def sha256(self) -> str | None:
@@ -177,7 +180,7 @@ class DatasetInfo:
         """
         if self.path is None:
             return None
-        if not self.path.is_file() or _file_state(self.path) != self._file_state:
+        if not self.path.is_file() or file_state(self.path) != self._file_state:
             raise DatasetIntegrityError(
                 "the file has changed since it was read", where=str(self.path), hint="Read it again", path=self.path
             )
@@ -194,6 +197,10 @@ class DatasetInfo:
         return float(returns.max() - returns.min()) if len(returns) else 0.0
 
 
-def _file_state(path: Path) -> tuple[int, int]:
+def file_state(path: Path) -> tuple[int, int]:
+    """
+    :param path: existing file
+    :return: its size and the time of its last change, nanoseconds
+    """
     status = os.stat(path)
     return status.st_size, status.st_mtime_ns

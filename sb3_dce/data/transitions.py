@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_dce.data.build import build_rows
+from sb3_dce.data.build import BuiltRows, build_rows
 from sb3_dce.data.catalog import DatasetSpec, normalized_score
 from sb3_dce.data.hashes import content_hash, file_sha256
 from sb3_dce.data.hdf5 import D4RLFile, write_hdf5
 from sb3_dce.data.layout import CORE_KEYS, ArraySource, RowLayout
+from sb3_dce.data.minari import Flatten, action_bounds, find_minari, reward_note
+from sb3_dce.data.minari_episodes import open_episodes
 from sb3_dce.data.npz import arrays_from_npz, npz_keys, write_npz
 from sb3_dce.data.records import DatasetInfo, ReadOptions
+from sb3_dce.data.row_cache import cached_rows
 from sb3_dce.data.sb3_buffer import arrays_from_replay_buffer
 from sb3_dce.data.tables import Columns, arrays_from_csv, arrays_from_dataframe, arrays_from_parquet
 from sb3_dce.errors import DatasetError, DatasetIntegrityError, DatasetSemanticsError, DatasetWarning
@@ -87,17 +90,8 @@ class Transitions:
         try:
             if spec is not None and spec.sha256 is not None:
                 _check_hash(path, spec)
-            url = spec.url if spec else None
-            with D4RLFile(path, max_bytes=read_options.max_bytes, url=url) as file:
-                if spec is not None and not spec.generated and file.attributes().get("generated", False):
-                    raise DatasetSemanticsError(
-                        f"the file carries the attribute generated = true, so it is not the official {spec.id}",
-                        where=str(path),
-                        hint="Give it its own name, such ids end in -sb3",
-                    )
-                sources = file.select(CORE_KEYS)
-                dataset_id = spec.id if spec else path.stem
-                return cls._build(sources, dataset_id, path, file.keys, spec, read_options)
+            reader = {"name": "hdf5"}
+            return cls._of(cached_rows(path, spec, read_options, reader, lambda: _rows_of_hdf5(path, spec, read_options)))
         except DatasetError as error:
             error.path = error.path or path
             raise
@@ -147,8 +141,11 @@ class Transitions:
         :raises DatasetError: if the file is missing, damaged, dangerous, of another layout, or its numbers make no sense
         """
         read_options = ReadOptions(**options)
-        arrays = arrays_from_npz(path, max_bytes=read_options.max_bytes)
-        return cls._from_file(arrays, path, npz_keys(path), spec, read_options)
+
+        def read() -> dict[str, np.ndarray]:
+            return arrays_from_npz(path, max_bytes=read_options.max_bytes)
+
+        return cls._from_file(read, path, spec, read_options, {"name": "npz"}, npz_keys)
 
     @classmethod
     def from_csv(
@@ -173,8 +170,11 @@ class Transitions:
         :raises DatasetError: if the file is missing, a line of it is wrong, or its numbers make no sense
         """
         read_options = ReadOptions(**options)
-        arrays = arrays_from_csv(path, columns, sep=sep, max_bytes=read_options.max_bytes)
-        return cls._from_file(arrays, path, arrays, spec, read_options)
+
+        def read() -> dict[str, np.ndarray]:
+            return arrays_from_csv(path, columns, sep=sep, max_bytes=read_options.max_bytes)
+
+        return cls._from_file(read, path, spec, read_options, {"name": "csv", "columns": columns, "sep": sep})
 
     @classmethod
     def from_parquet(
@@ -197,8 +197,11 @@ class Transitions:
         :raises DatasetError: if the file is missing or damaged, or its numbers make no sense
         """
         read_options = ReadOptions(**options)
-        arrays = arrays_from_parquet(path, columns, max_bytes=read_options.max_bytes)
-        return cls._from_file(arrays, path, arrays, spec, read_options)
+
+        def read() -> dict[str, np.ndarray]:
+            return arrays_from_parquet(path, columns, max_bytes=read_options.max_bytes)
+
+        return cls._from_file(read, path, spec, read_options, {"name": "parquet", "columns": columns})
 
     @classmethod
     def from_dataframe(cls, frame: pd.DataFrame, columns: Columns | None = None, **options: Any) -> Transitions:
@@ -231,16 +234,51 @@ class Transitions:
         return cls.from_arrays(**arrays, **{**bounds, **options})
 
     @classmethod
+    def from_minari(cls, name: str | PathLike[str], *, flatten: Flatten = False, **options: Any) -> Transitions:
+        """
+        Read a Minari dataset that is on this machine. Minari need not be installed.
+
+        Every step is used: next observations are known, whatever ended the episode.
+
+        :param name: id such as ``D4RL/door/human-v2``, with or without ``minari:`` before it, or a path: the folder of the
+            dataset, its ``metadata.json`` or ``main_data.hdf5``
+        :param flatten: of observations that consist of several arrays: True joins all in the order of the observation space,
+            keys such as ``["observation", "desired_goal"]`` join these in this order
+        :param options: fields of :class:`~sb3_dce.data.records.ReadOptions`; the bounds of the actions are those of the
+            dataset's action space
+        :return: the dataset
+        :raises DatasetNotFoundError: if it is not on this machine; the message says how to download it
+        :raises ConfigError: if ``flatten`` does not fit, or a package is missing that the format of the data needs
+        :raises DatasetError: if it is damaged or dangerous, an observation is no vector, or its numbers make no sense
+        """
+        dataset = find_minari(name)
+        bounds = action_bounds(dataset)
+        if not any(options.get(key) is not None for key in ("action_low", "action_high", "action_scale")):
+            options |= bounds
+        read_options = ReadOptions(**options)
+        with open_episodes(dataset, flatten, read_options.max_bytes) as (sources, notes):
+            notes += reward_note(dataset.name)
+            return cls._build(sources, dataset.name, dataset.file, sources, None, read_options, notes)
+
+    @classmethod
     def _from_file(
         cls,
-        arrays: Mapping[str, np.ndarray],
+        read: Callable[[], dict[str, np.ndarray]],
         path: str | PathLike[str],
-        found_keys: Any,
         spec: DatasetSpec | None,
         options: ReadOptions,
+        reader: Mapping[str, Any],
+        keys_of: Callable[[Path], list[str]] | None = None,
     ) -> Transitions:
-        path = Path(path)
-        return cls._build(arrays, spec.id if spec else path.stem, path, found_keys, spec, options)
+        file = Path(path)
+
+        def build() -> BuiltRows:
+            arrays = read()
+            found_keys = keys_of(file) if keys_of else arrays
+            dataset_id = spec.id if spec else file.stem
+            return build_rows(arrays, dataset_id=dataset_id, path=file, found_keys=found_keys, spec=spec, options=options)
+
+        return cls._of(cached_rows(file, spec, options, reader, build))
 
     @classmethod
     def _build(
@@ -251,12 +289,17 @@ class Transitions:
         found_keys: Any,
         spec: DatasetSpec | None,
         options: ReadOptions,
+        notes: Sequence[str] = (),
     ) -> Transitions:
         built = build_rows(sources, dataset_id=dataset_id, path=path, found_keys=found_keys, spec=spec, options=options)
+        return cls._of(built, notes)
+
+    @classmethod
+    def _of(cls, built: BuiltRows, notes: Sequence[str] = ()) -> Transitions:
         for text in built.info.warnings:
-            warnings.warn(f"{dataset_id}: {text}", DatasetWarning, stacklevel=3)
-        layout = built.layout
-        return cls(built.rows, built.timeouts, built.episodes, (layout.obs_dim,), layout.act_dim, built.info)
+            warnings.warn(f"{built.info.id}: {text}", DatasetWarning, stacklevel=3)
+        layout, info = built.layout, replace(built.info, notes=(*notes, *built.info.notes))
+        return cls(built.rows, built.timeouts, built.episodes, (layout.obs_dim,), layout.act_dim, info)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -354,6 +397,18 @@ class Transitions:
     @property
     def _layout(self) -> RowLayout:
         return RowLayout(int(np.prod(self.obs_shape)), self.act_dim)
+
+
+def _rows_of_hdf5(path: Path, spec: DatasetSpec | None, options: ReadOptions) -> BuiltRows:
+    with D4RLFile(path, max_bytes=options.max_bytes, url=spec.url if spec else None) as file:
+        if spec is not None and not spec.generated and file.attributes().get("generated", False):
+            raise DatasetSemanticsError(
+                f"the file carries the attribute generated = true, so it is not the official {spec.id}",
+                where=str(path),
+                hint="Give it its own name, such ids end in -sb3",
+            )
+        dataset_id, sources = spec.id if spec else path.stem, file.select(CORE_KEYS)
+        return build_rows(sources, dataset_id=dataset_id, path=path, found_keys=file.keys, spec=spec, options=options)
 
 
 def _check_hash(path: Path, spec: DatasetSpec) -> None:
