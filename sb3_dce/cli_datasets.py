@@ -12,15 +12,22 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from sb3_dce import cli_recording
+
 if TYPE_CHECKING:
     from sb3_dce.data.advice import Check
 
 app = typer.Typer(help="What data there are, and what is in them.", no_args_is_help=True)
+app.command("record")(cli_recording.record_dataset)
+app.command("generate")(cli_recording.generate_dataset)
 
 console = Console(highlight=False)
-DatasetArgument = Annotated[str, typer.Argument(help="Id such as [b]walker2d-medium[/b], or an HDF5 file in D4RL layout.")]
+DatasetArgument = Annotated[
+    str, typer.Argument(help="Id such as [b]walker2d-medium[/b] or [b]minari:D4RL/door/human-v2[/b], or a file.")
+]
 BetaOption = Annotated[
-    float | None, typer.Option(show_default=False, help="Penalty weight of the survival condition; default: the dataset's row.")
+    float | None,
+    typer.Option(show_default=False, help="Penalty weight of the survival condition; default: the dataset's row."),
 ]
 ActionLowOption = Annotated[float | None, typer.Option(show_default=False, help="Smallest allowed action; default -1.")]
 ActionHighOption = Annotated[float | None, typer.Option(show_default=False, help="Largest allowed action; default 1.")]
@@ -164,7 +171,9 @@ def _print_checks(checks: Iterable[Check]) -> None:
 
 @app.command("download")
 def download_dataset(
-    dataset: Annotated[str, typer.Argument(metavar="ID", help="Id such as [b]walker2d-medium[/b].")],
+    dataset: Annotated[
+        str, typer.Argument(metavar="ID", help="Id such as [b]walker2d-medium[/b] or [b]minari:D4RL/door/human-v2[/b].")
+    ],
     cache_dir: Annotated[
         Path | None,
         typer.Option(show_default=False, help="Folder of the file; default: the first in which data are looked for."),
@@ -174,7 +183,22 @@ def download_dataset(
     ] = None,
     force: Annotated[bool, typer.Option(help="Download even if the file is there, and replace it.")] = False,
 ) -> None:
-    """Download a D4RL dataset. The same command goes on with an interrupted download."""
+    """Download a dataset of D4RL or, by minari, of Minari. The same command goes on with an interrupted download."""
+    from sb3_dce.data.minari import ROOT_VARIABLE, is_minari_name
+
+    if is_minari_name(dataset):
+        from sb3_dce.data.minari_download import REMOTE_VARIABLE, download_minari
+        from sb3_dce.errors import ConfigError
+
+        if cache_dir is not None or mirror:
+            raise ConfigError(
+                "--cache-dir and --mirror are for D4RL's files",
+                where=dataset,
+                hint=f"Minari has ${ROOT_VARIABLE} for the folder and ${REMOTE_VARIABLE} for the source.",
+            )
+        console.print(f"file   {download_minari(dataset, force=force)}", markup=False)
+        return
+
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
     from sb3_dce.data.download import download
