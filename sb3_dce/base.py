@@ -29,6 +29,7 @@ from sb3_dce.errors import ConfigError, SB3DCEWarning
 from sb3_dce.execution import EXECUTIONS, Engine, Update, choose_execution, refuse_divergence
 from sb3_dce.networks import StandardizedExtractor
 from sb3_dce.noise import NoiseSpec
+from sb3_dce.precision import PRECISIONS, matmul_precision
 from sb3_dce.saving import SavingMixin
 from sb3_dce.state import Storage, TrainState
 
@@ -57,8 +58,10 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
     :param reward_normalization: ``"iql"`` multiplies rewards by 1000 / (largest - smallest episode return)
     :param reward_scale: factor on every reward
     :param reward_shift: added to every reward after scaling, reward units
-    :param execution: ``"eager"``, ``"compile"``, or ``"auto"``: compile when more than 10,000 updates are planned and a
-        C++ compiler is there
+    :param execution: ``"eager"``, ``"compile"`` (one compiled graph), ``"cudagraph"`` (that graph captured, on a CUDA
+        device), or ``"auto"``: the fast form when more than 10,000 updates are planned and a C++ compiler is there
+    :param precision: of matrix products: ``"float32"``, ``"bf16-matmul"`` on processors that have it, ``"tf32"`` on a CUDA
+        device. Parameters stay float32; the switch is put back after training
     :param stats_window_size: kept for Stable-Baselines3's logger
     :param tensorboard_log: folder of TensorBoard logs
     :param policy_kwargs: arguments of the policy, such as ``net_arch`` or ``n_critics``
@@ -86,6 +89,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         reward_scale: float = 1.0,
         reward_shift: float = 0.0,
         execution: str,
+        precision: str = "float32",
         stats_window_size: int,
         tensorboard_log: str | None,
         policy_kwargs: dict[str, Any] | None,
@@ -124,10 +128,12 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         self.reward_scale = reward_scale
         self.reward_shift = reward_shift
         self.execution = execution
+        self.precision = precision
         self.dataset_statistics = None
         self._engine: Engine | None = None
         self._generator: th.Generator | None = None
         self._coef: dict[str, th.Tensor] = {}
+        self._coef_values: dict[str, float] = {}  # what the tensors hold
         self._warned_large_q = False
         self._new_run = True
         self._metrics_read_at = (time.time_ns(), 0)
@@ -204,6 +210,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         check_number("reward_scale", self.reward_scale, 0, open_low=True)
         check_number("reward_shift", self.reward_shift, -float("inf"), open_low=True)
         check_choice("execution", self.execution, EXECUTIONS)
+        check_choice("precision", self.precision, PRECISIONS)
         check_choice("reward_normalization", self.reward_normalization, (None, "iql"))
         if not callable(self.learning_rate):
             check_number("learning_rate", self.learning_rate, 0, hint="The paper uses 3e-4.")
@@ -301,15 +308,16 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         rates = self.learning_rates()
         for name, storage in engine.state.storages.items():
             storage.set_learning_rate(rates.get(f"{name}_learning_rate", rates["learning_rate"]))
-        for _ in range(gradient_steps):
-            rows = buffer.size()
-            indices = th.randint(rows, (batch_size,), generator=generator, device=self.device)
-            batch = buffer.gather(indices, self._vec_normalize_env)
-            if dtype != th.float32:
-                batch = batch._replace(**{k: v.to(dtype) for k, v in batch._asdict().items() if v is not None})
-            noise = {name: spec.draw(generator, self.device, dtype) for name, spec in specs.items()}
-            engine.step(batch, noise, self._coefficient_tensors(dtype), **self.update_variant(self._n_updates))
-            self._n_updates += 1
+        with matmul_precision(self.precision, self.device):
+            for _ in range(gradient_steps):
+                rows = buffer.size()
+                indices = th.randint(rows, (batch_size,), generator=generator, device=self.device)
+                batch = buffer.gather(indices, self._vec_normalize_env)
+                if dtype != th.float32:
+                    batch = batch._replace(**{k: v.to(dtype) for k, v in batch._asdict().items() if v is not None})
+                noise = {name: spec.draw(generator, self.device, dtype) for name, spec in specs.items()}
+                engine.step(batch, noise, self._coefficient_tensors(dtype), **self.update_variant(self._n_updates))
+                self._n_updates += 1
 
     def _bound_engine(self, planned_updates: int) -> Engine:
         """
@@ -319,7 +327,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         engine = self._engine if self._engine is not None and self._engine.state.is_bound() else None
         execution = None if engine is None else engine.execution
         if engine is None or (self._new_run and execution == "eager"):
-            execution = choose_execution(self.execution, planned_updates)
+            execution = choose_execution(self.execution, planned_updates, self.device)
         self._new_run = False
         if engine is None or execution != engine.execution:
             storages = self.make_storages()
@@ -334,9 +342,10 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         for name, value in self.coefficients(self._n_updates).items():
             if name not in self._coef or self._coef[name].dtype != dtype:
                 self._coef[name] = th.tensor(value, dtype=dtype, device=self.device)
-            else:
+            elif self._coef_values[name] != value:
                 # In place: a compiled or captured step reads the tensor, not a number baked in when it was traced.
                 self._coef[name].fill_(value)
+            self._coef_values[name] = value
         return self._coef
 
     def learn(

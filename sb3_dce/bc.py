@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, S
 from sb3_dce import losses
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
-from sb3_dce.checks import check_choice, check_optional
+from sb3_dce.checks import check_choice, check_number, check_optional
 from sb3_dce.execution import Update
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import ActorPolicy
@@ -27,6 +27,8 @@ class OfflineBC(OfflineAlgorithm):
 
     :param bc_loss: ``"mse"`` trains the deterministic action (default), ``"nll"`` the whole distribution; its
         log-probabilities need actions inside (-1, 1), so data are clipped to +-(1 - 1e-5) there
+    :param fraction: clone only this share of the whole episodes, the best by undiscounted return (0.1 is "10 % BC"); 1.0 uses
+        all rows. The chosen rows are copied
     :param max_grad_norm: clip the gradient to this norm; ``None`` is off
     """
 
@@ -44,10 +46,12 @@ class OfflineBC(OfflineAlgorithm):
         batch_size: int = 256,
         gradient_steps: int = 1,
         bc_loss: str = "mse",
+        fraction: float = 1.0,
         max_grad_norm: float | None = None,
         d4rl_compat: bool = False,
         normalize_obs: bool = False,
         execution: str = "auto",
+        precision: str = "float32",
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -66,6 +70,7 @@ class OfflineBC(OfflineAlgorithm):
             d4rl_compat=d4rl_compat,
             normalize_obs=normalize_obs,
             execution=execution,
+            precision=precision,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
             policy_kwargs=policy_kwargs,
@@ -75,6 +80,7 @@ class OfflineBC(OfflineAlgorithm):
             needs_env=_init_setup_model,
         )
         self.bc_loss = bc_loss
+        self.fraction = fraction
         self.max_grad_norm = max_grad_norm
         if _init_setup_model:
             self._setup_model()
@@ -82,6 +88,7 @@ class OfflineBC(OfflineAlgorithm):
     def check_parameters(self) -> None:
         super().check_parameters()
         check_choice("bc_loss", self.bc_loss, ("mse", "nll"))
+        check_number("fraction", self.fraction, 0, 1, open_low=True, hint="0.1 clones the best tenth of the episodes.")
         check_optional("max_grad_norm", self.max_grad_norm)
 
     def make_update(self, storages: dict[str, Storage]) -> Update:

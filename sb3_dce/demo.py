@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch as th
 from rich.console import Console
 from rich.table import Table
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -63,7 +64,7 @@ def run_demo(folder: Path, n_seeds: int, fresh: bool, console: Console) -> dict[
     env = make_eval_env(DATASET, N_EVAL_EPISODES)
     if env is None:
         raise ConfigError("the demo evaluates in MuJoCo, which is not installed", key="mujoco", hint="pip install mujoco")
-    if choose_execution("auto", N_UPDATES) == "eager":
+    if choose_execution("auto", N_UPDATES, th.device("cpu")) == "eager":
         n_seeds = 1
         console.print("No C++ compiler found: updates run uncompiled, about four times slower, so with one seed only.")
     specs = [demo_spec(algo, seed, folder) for seed in range(n_seeds) for algo in ("dce", "offline_bc")]

@@ -3,6 +3,7 @@ Ways of running an update. The update itself is one pure function; what differs 
 
 ``eager`` calls it as it stands and is the reference of all tests. ``compile`` turns the whole step (losses, gradients,
 optimizers, moving averages and the write-back) into one compiled graph; it pays back after some ten thousand updates.
+``cudagraph`` captures that compiled step once and replays it, which leaves no launches to the processor.
 """
 
 from __future__ import annotations
@@ -10,9 +11,10 @@ from __future__ import annotations
 import shutil
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch as th
+from torch.utils._pytree import tree_leaves, tree_map
 
 from sb3_dce.errors import DivergenceError, SB3DCEWarning
 from sb3_dce.state import TrainState
@@ -20,25 +22,36 @@ from sb3_dce.state import TrainState
 # (state tree, batch, noise, coefficients) -> (new state tree, metrics), see the ``update`` of an algorithm.
 Update = Callable[..., tuple[dict[str, Any], dict[str, th.Tensor]]]
 
-EXECUTIONS = ("auto", "eager", "compile")
+Variant = tuple[tuple[str, Any], ...]
+# update with write-back: (state, batch, noise, coefficients) -> metrics
+Step = Callable[[dict[str, Any], Any, dict[str, th.Tensor], dict[str, th.Tensor]], dict[str, th.Tensor]]
+
+EXECUTIONS = ("auto", "eager", "compile", "cudagraph")
 
 # Compiling costs 10 to 35 s of CPU time and saves a few milliseconds per update.
 UPDATES_WORTH_COMPILING = 10_000
 
 
-def choose_execution(execution: str, planned_updates: int) -> str:
+def choose_execution(execution: str, planned_updates: int, device: th.device) -> str:
     """
-    :param execution: "auto", "eager" or "compile"
+    :param execution: "auto", "eager", "compile" or "cudagraph"
     :param planned_updates: updates the caller is going to run
-    :return: "eager" or "compile"; "compile" without a C++ compiler falls back with a warning
+    :param device: where the model lies
+    :return: one of the last three; what cannot be had falls back to the next simpler one, with a warning if it was asked for
     """
     wanted = execution
     if execution == "auto":
-        wanted = "compile" if planned_updates > UPDATES_WORTH_COMPILING else "eager"
+        fast = "cudagraph" if device.type == "cuda" else "compile"
+        wanted = fast if planned_updates > UPDATES_WORTH_COMPILING else "eager"
+    if wanted == "cudagraph" and device.type != "cuda":
+        warnings.warn(
+            f"execution='cudagraph' needs a model on a CUDA device, this one is on {device}: trying 'compile'.", SB3DCEWarning
+        )
+        wanted = "compile"
     if wanted == "compile" and not _has_compiler():
-        if execution == "compile":
+        if execution != "auto":
             warnings.warn(
-                "execution='compile' needs a C++ compiler (g++ or clang++) on the PATH and found none: running eager.",
+                f"execution={execution!r} needs a C++ compiler (g++ or clang++) on the PATH and found none: running eager.",
                 SB3DCEWarning,
             )
         return "eager"
@@ -50,36 +63,65 @@ def _has_compiler() -> bool:
 
 
 class MetricSums:
-    """Sums of metrics on the device, read back only when a log row is due."""
+    """
+    Sums of metrics on the device, read back only when a log row is due.
+
+    The tensors stay where they are from the first update on, so that a captured step can add to them.
+    """
 
     def __init__(self) -> None:
-        self._sums: dict[tuple[str, ...], tuple[th.Tensor, int]] = {}
+        self._totals: dict[tuple[str, ...], th.Tensor] = {}
+        self._counts: dict[tuple[str, ...], int] = {}
 
     def add(self, metrics: dict[str, th.Tensor]) -> None:
         """
-        :param metrics: 0-dimensional tensors of one update
+        :param metrics: of one update, each 0-dimensional, or of shape (models,)
+        """
+        self.count(self.accumulate(metrics))
+
+    def accumulate(self, metrics: dict[str, th.Tensor]) -> tuple[str, ...]:
+        """
+        Add on the device only; what a captured step does.
+
+        :param metrics: of one update, each 0-dimensional, or of shape (models,)
+        :return: their names, for :meth:`count`
         """
         names = tuple(metrics)
-        values = th.stack([value.reshape(()) for value in metrics.values()])
-        if names in self._sums:
-            total, count = self._sums[names]
-            self._sums[names] = (total.add_(values), count + 1)
-        else:
-            self._sums[names] = (values.clone(), 1)
+        values = th.stack(list(metrics.values()))
+        if names not in self._totals:
+            self._totals[names], self._counts[names] = th.zeros_like(values), 0
+        self._totals[names].add_(values)
+        return names
+
+    def count(self, names: tuple[str, ...]) -> None:
+        """
+        :param names: metrics of which one more update has been added
+        """
+        self._counts[names] += 1
 
     def read(self, clear: bool = True) -> dict[str, float]:
         """
         :param clear: start new sums
-        :return: mean of each metric since the sums were last cleared
+        :return: mean of each metric since the sums were last cleared, names in the order of the updates
         """
-        totals: dict[str, float] = {}
+        return {name: float(value) for name, value in self.read_members(clear).items()}
+
+    def read_members(self, clear: bool = True) -> dict[str, th.Tensor]:
+        """
+        :param clear: start new sums
+        :return: mean of each metric since the sums were last cleared, each of shape () or (models,), on the CPU
+        """
+        totals: dict[str, th.Tensor] = {}
         counts: dict[str, int] = {}
-        for names, (total, count) in self._sums.items():
-            for name, value in zip(names, total.tolist(), strict=True):
-                totals[name] = totals.get(name, 0.0) + value
-                counts[name] = counts.get(name, 0) + count
-        if clear:
-            self._sums.clear()
+        for names, total in self._totals.items():
+            if self._counts[names] == 0:
+                continue
+            for name, value in zip(names, total.cpu().clone(), strict=True):
+                totals[name] = totals[name] + value if name in totals else value
+                counts[name] = counts.get(name, 0) + self._counts[names]
+            if clear:
+                total.zero_()
+                self._counts[names] = 0
         return {name: totals[name] / counts[name] for name in totals}
 
 
@@ -101,11 +143,11 @@ def refuse_divergence(means: dict[str, float], first: int, last: int) -> None:
 
 class Engine:
     """
-    Runs updates on one model's state.
+    Runs updates on one state, that of a model or of a whole population.
 
     :param update: pure update, ``update(state, batch, noise, coef, **variant)``
     :param state: storage of the model
-    :param execution: "eager" or "compile"
+    :param execution: "eager", "compile" or "cudagraph"
     """
 
     def __init__(self, update: Update, state: TrainState, execution: str) -> None:
@@ -113,7 +155,8 @@ class Engine:
         self.execution = execution
         self.metrics = MetricSums()
         self._update = update
-        self._compiled: dict[tuple[tuple[str, Any], ...], Callable[..., dict[str, th.Tensor]]] = {}
+        self._compiled: dict[Variant, Step] = {}
+        self._captured: dict[Variant, CapturedStep] = {}
 
     def step(self, batch: Any, noise: dict[str, th.Tensor], coef: dict[str, th.Tensor], **variant: Any) -> None:
         """
@@ -121,36 +164,49 @@ class Engine:
 
         :param batch: replay data
         :param noise: random numbers of this update
-        :param coef: 0-dimensional coefficients
+        :param coef: coefficients, the same tensors at every call
         :param variant: choices fixed at trace time, such as ``with_actor``
         """
-        if self.execution == "compile":
-            metrics = self._compiled_step(batch, noise, coef, variant)
-        else:
-            with th.no_grad():
-                new, metrics = self._update(self.state.read(), batch, noise, coef, **variant)
-                self.state.write(new)
-        self.metrics.add(metrics)
-
-    def _compiled_step(
-        self, batch: Any, noise: dict[str, th.Tensor], coef: dict[str, th.Tensor], variant: dict[str, Any]
-    ) -> dict[str, th.Tensor]:
         key = tuple(sorted(variant.items()))
-        first_time = key not in self._compiled
-        if first_time:
-            self._compiled[key] = th.compile(self._in_place(variant), fullgraph=True, dynamic=False)
-        try:
-            with th.no_grad():
-                return self._compiled[key](self.state.read(), batch, noise, coef)
-        except Exception as error:  # any failure of the compiler: the eager form computes the same
-            if not first_time:
-                raise
-            warnings.warn(f"compiling the update failed, running eager: {str(error).splitlines()[0]}", SB3DCEWarning)
-            self.execution = "eager"
-            with th.no_grad():
-                return self._in_place(variant)(self.state.read(), batch, noise, coef)
+        with th.no_grad():
+            if self.execution == "eager":
+                self.metrics.add(self._in_place(variant)(self.state.read(), batch, noise, coef))
+            elif self.execution == "compile":
+                self.metrics.add(self._compiled_step(key)(self.state.read(), batch, noise, coef))
+            else:
+                self._captured_step(key, batch, noise, coef).replay(batch, noise)
 
-    def _in_place(self, variant: dict[str, Any]) -> Callable[..., dict[str, th.Tensor]]:
+    def _compiled_step(self, key: Variant) -> Step:
+        if key not in self._compiled:
+            compiled = th.compile(self._in_place(dict(key)), fullgraph=True, dynamic=False)
+            self._compiled[key] = self._guarded(compiled, key)
+        return self._compiled[key]
+
+    def _guarded(self, compiled: Step, key: Variant) -> Step:
+        """The first call compiles; any failure of the compiler is no reason to stop, since eager computes the same."""
+
+        def first_call(*arguments: Any) -> dict[str, th.Tensor]:
+            try:
+                metrics = compiled(*arguments)
+                self._compiled[key] = compiled
+            except Exception as error:
+                warnings.warn(f"compiling the update failed, running eager: {str(error).splitlines()[0]}", SB3DCEWarning)
+                self.execution = "eager"
+                metrics = self._in_place(dict(key))(*arguments)
+            return metrics
+
+        return first_call
+
+    def _captured_step(
+        self, key: Variant, batch: Any, noise: dict[str, th.Tensor], coef: dict[str, th.Tensor]
+    ) -> CapturedStep:
+        captured = self._captured.get(key)
+        if captured is None or not captured.fits(batch, coef):
+            step = self._compiled_step(key) if _has_compiler() else self._in_place(dict(key))
+            captured = self._captured[key] = CapturedStep(step, self.state.read(), batch, noise, coef, self.metrics)
+        return captured
+
+    def _in_place(self, variant: dict[str, Any]) -> Step:
         def run(state: dict[str, Any], batch: Any, noise: Any, coef: Any) -> dict[str, th.Tensor]:
             new, metrics = self._update(state, batch, noise, coef, **variant)
             for name, value in new.items():
@@ -160,3 +216,92 @@ class Engine:
             return metrics
 
         return run
+
+
+class StaticInputs(NamedTuple):
+    """Buffers that a captured step reads: each call copies its batch and noise there."""
+
+    batch: Any
+    noise: dict[str, th.Tensor]
+
+    @classmethod
+    def like(cls, batch: Any, noise: dict[str, th.Tensor]) -> StaticInputs:
+        """
+        :param batch: replay data
+        :param noise: random numbers
+        :return: buffers with their shapes and values
+        """
+        return cls(*tree_map(lambda leaf: leaf.clone() if isinstance(leaf, th.Tensor) else leaf, (batch, noise)))
+
+    def fill(self, batch: Any, noise: dict[str, th.Tensor]) -> None:
+        """
+        :param batch: replay data of the shapes given at first
+        :param noise: random numbers of the shapes given at first
+        """
+        for old, new in zip(tree_leaves(tuple(self)), tree_leaves((batch, noise)), strict=True):
+            if isinstance(old, th.Tensor):
+                old.copy_(new)
+
+
+class CapturedStep:
+    """
+    One update as a CUDA graph. The updates that warm it up are real ones: nothing is thrown away.
+
+    :param step: update with write-back
+    :param state: tensors of the model, which must stay where they are
+    :param batch: replay data of the first update
+    :param noise: its random numbers
+    :param coef: coefficients, read at every replay from where they are now
+    :param metrics: sums that the graph adds to
+    """
+
+    # Compiler and libraries allocate and tune during the first calls, which a capture does not allow.
+    WARM_UP = 3
+
+    def __init__(
+        self, step: Step, state: Any, batch: Any, noise: Any, coef: dict[str, th.Tensor], metrics: MetricSums
+    ) -> None:
+        self._step, self._state, self._coef, self._metrics = step, state, coef, metrics
+        self._inputs = StaticInputs.like(batch, noise)
+        self._stream = th.cuda.Stream()
+        self._calls = 0
+        self._graph: th.cuda.CUDAGraph | None = None
+        self._names: tuple[str, ...] = ()
+
+    def fits(self, batch: Any, coef: dict[str, th.Tensor]) -> bool:
+        """
+        :param batch: replay data
+        :param coef: coefficients
+        :return: whether the graph reads these coefficients and has room for this batch
+        """
+        pairs = zip(tree_leaves(self._inputs.batch), tree_leaves(batch), strict=True)
+        same_shapes = all(old.shape == new.shape for old, new in pairs if isinstance(old, th.Tensor))
+        return same_shapes and all(coef[name] is tensor for name, tensor in self._coef.items())
+
+    def replay(self, batch: Any, noise: dict[str, th.Tensor]) -> None:
+        """
+        One update.
+
+        :param batch: replay data
+        :param noise: random numbers
+        """
+        self._inputs.fill(batch, noise)
+        if self._graph is not None:
+            self._graph.replay()
+            self._metrics.count(self._names)
+            return
+        self._stream.wait_stream(th.cuda.current_stream())
+        with th.cuda.stream(self._stream):
+            self._run()
+        th.cuda.current_stream().wait_stream(self._stream)
+        self._metrics.count(self._names)
+        self._calls += 1
+        if self._calls == self.WARM_UP:
+            graph = th.cuda.CUDAGraph()
+            with th.cuda.graph(graph, stream=self._stream):  # computes nothing yet
+                self._run()
+            self._graph = graph
+
+    def _run(self) -> None:
+        metrics = self._step(self._state, self._inputs.batch, self._inputs.noise, self._coef)
+        self._names = self._metrics.accumulate(metrics)

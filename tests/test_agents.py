@@ -980,7 +980,7 @@ def test_long_run_after_a_short_one_is_compiled(transitions: Transitions, monkey
     """``execution="auto"`` decides by the updates of the run at hand, not by those of the first one."""
     planned: list[int] = []
 
-    def choose(execution: str, planned_updates: int) -> str:
+    def choose(execution: str, planned_updates: int, device: th.device) -> str:
         planned.append(planned_updates)
         return "eager"
 

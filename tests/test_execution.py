@@ -1,0 +1,159 @@
+"""Ways of running an update: which one is taken, what they sum up, and switches that are put back."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import pytest
+import torch as th
+from update_tools import all_tensors, largest_difference, needs_compiler, record_steps, to_float64
+
+from sb3_dce import OfflineDCE, Transitions
+from sb3_dce.errors import ConfigError, SB3DCEWarning
+from sb3_dce.execution import MetricSums, StaticInputs, choose_execution
+from sb3_dce.precision import _warn_once, matmul_precision
+
+CPU, CUDA = th.device("cpu"), th.device("cuda")
+
+
+@pytest.mark.parametrize(
+    ("execution", "planned", "device", "chosen"),
+    [
+        ("eager", 10**6, CPU, "eager"),
+        ("auto", 10_000, CPU, "eager"),
+        ("auto", 10_000, CUDA, "eager"),
+        ("auto", 10_001, CUDA, "cudagraph"),
+        ("cudagraph", 1, CUDA, "cudagraph"),
+    ],
+)
+def test_execution_that_is_chosen(execution: str, planned: int, device: th.device, chosen: str) -> None:
+    assert choose_execution(execution, planned, device) == chosen
+
+
+@needs_compiler
+def test_long_runs_are_compiled_on_a_processor() -> None:
+    assert choose_execution("auto", 10_001, CPU) == "compile"
+    with pytest.warns(SB3DCEWarning, match="CUDA device, this one is on cpu"):
+        assert choose_execution("cudagraph", 1, CPU) == "compile"
+
+
+@pytest.mark.parametrize("execution", ["compile", "cudagraph"])
+def test_without_a_compiler_updates_run_eager(execution: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shutil.which", lambda name: None)
+    with pytest.warns(SB3DCEWarning, match=f"{execution}.* needs a C"):
+        assert choose_execution(execution, 10**6, CPU) == "eager"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert choose_execution("auto", 10**6, CPU) == "eager"
+
+
+def test_failing_compiler_is_no_reason_to_stop(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(function: Any, **options: Any) -> Any:
+        def call(*arguments: Any) -> Any:
+            raise RuntimeError("no such instruction")
+
+        return call
+
+    monkeypatch.setattr(th, "compile", broken)
+    kwargs = {"dataset": transitions, "batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "seed": 0}
+    eager, broken_model = (OfflineDCE("MlpPolicy", execution=e, **kwargs) for e in ("eager", "compile"))
+    with pytest.warns(SB3DCEWarning, match="compiling the update failed, running eager: no such instruction") as caught:
+        broken_model.learn(3)
+    assert len([w for w in caught if "compiling" in str(w.message)]) == 1
+    assert largest_difference(all_tensors(eager.learn(3)), all_tensors(broken_model)) == 0.0
+
+
+def test_metric_sums_average_over_the_updates_that_had_the_metric() -> None:
+    sums = MetricSums()
+    assert sums.read() == {}
+    for n in range(4):
+        metrics = {"a": th.tensor(float(n))}
+        sums.add(metrics if n % 2 else {**metrics, "b": th.tensor(10.0 * n)})
+    assert sums.read(clear=False) == {"a": 1.5, "b": 10.0}
+    assert sums.read() == {"a": 1.5, "b": 10.0}
+    assert sums.read() == {}
+    sums.add({"a": th.tensor(7.0)})
+    assert sums.read() == {"a": 7.0}
+
+
+def test_metric_sums_keep_the_members_of_a_population_apart() -> None:
+    sums = MetricSums()
+    for n in range(2):
+        sums.add({"a": th.tensor([1.0, 2.0]) * n, "b": th.tensor([0.0, 4.0])})
+    means = sums.read_members()
+    assert means["a"].tolist() == [0.5, 1.0] and means["b"].tolist() == [0.0, 4.0]
+
+
+def test_metric_sums_stay_where_they_are() -> None:
+    """A captured step adds to these tensors for ever."""
+    sums = MetricSums()
+    names = sums.accumulate({"a": th.tensor(1.0)})
+    total = sums._totals[names]
+    sums.count(names)
+    sums.read()
+    sums.add({"a": th.tensor(2.0)})
+    assert sums._totals[names] is total and total.tolist() == [2.0]
+
+
+def test_static_inputs_take_over_values_and_keep_their_place(
+    transitions: Transitions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorded = record_steps(monkeypatch)
+    OfflineDCE("MlpPolicy", dataset=transitions, batch_size=8, policy_kwargs={"net_arch": [8]}, seed=0).learn(2)
+    first, second = recorded
+    static = StaticInputs.like(first.batch, first.noise)
+    place = static.batch.observations.data_ptr()
+    assert place != first.batch.observations.data_ptr()
+    static.fill(second.batch, second.noise)
+    assert static.batch.observations.data_ptr() == place
+    assert th.equal(static.batch.observations, second.batch.observations)
+    assert th.equal(static.noise["actor"], second.noise["actor"])
+
+
+def test_a_setting_changed_between_calls_is_seen_by_the_next_update(transitions: Transitions) -> None:
+    kwargs = {"dataset": transitions, "batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "seed": 0, "execution": "eager"}
+    one, other = (to_float64(OfflineDCE("MlpPolicy", beta=1.0, **kwargs)) for _ in range(2))
+    for model in (one, other):
+        model.train(2, 8)
+    other.beta = 3.0
+    for model in (one, other):
+        model.train(1, 8)
+    assert (one.read_metrics()["beta"], other.read_metrics()["beta"]) == (1.0, pytest.approx(5 / 3))
+    assert largest_difference(all_tensors(one), all_tensors(other)) > 0
+
+
+# -- precision ---------------------------------------------------------------------------------------------------------
+
+
+def test_unknown_precision_is_refused(transitions: Transitions) -> None:
+    with pytest.raises(ConfigError, match="precision"):
+        OfflineDCE("MlpPolicy", dataset=transitions, precision="float16")
+
+
+def test_precision_a_device_does_not_have_is_left_out_with_one_warning(transitions: Transitions) -> None:
+    _warn_once.cache_clear()
+    kwargs = {"dataset": transitions, "batch_size": 8, "policy_kwargs": {"net_arch": [8]}, "seed": 0}
+    plain = OfflineDCE("MlpPolicy", **kwargs).learn(3)
+    with pytest.warns(SB3DCEWarning, match="tf32.*needs a CUDA device") as caught:
+        rounded = OfflineDCE("MlpPolicy", precision="tf32", **kwargs).learn(3)
+    assert len([w for w in caught if "tf32" in str(w.message)]) == 1
+    assert largest_difference(all_tensors(plain), all_tensors(rounded)) == 0.0
+
+
+def test_precision_switch_is_put_back_even_after_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_dce.precision._missing", lambda precision, device: None)
+    before = th.backends.mkldnn.matmul.fp32_precision
+    with pytest.raises(RuntimeError, match="stop"), matmul_precision("bf16-matmul", CPU):
+        assert th.backends.mkldnn.matmul.fp32_precision == "bf16"
+        raise RuntimeError("stop")
+    assert th.backends.mkldnn.matmul.fp32_precision == before
+    with matmul_precision("float32", CPU):
+        assert th.backends.mkldnn.matmul.fp32_precision == before
+
+
+@pytest.mark.skipif(not th.ops.mkldnn._is_mkldnn_bf16_supported(), reason="needs a processor with bf16 products")
+def test_bf16_products_change_the_numbers_a_little(transitions: Transitions) -> None:
+    kwargs = {"dataset": transitions, "batch_size": 64, "policy_kwargs": {"net_arch": [64, 64]}, "seed": 0}
+    plain, rounded = (OfflineDCE("MlpPolicy", precision=p, **kwargs).learn(5) for p in ("float32", "bf16-matmul"))
+    assert 0.0 < largest_difference(all_tensors(plain), all_tensors(rounded)) < 0.05
