@@ -230,6 +230,10 @@ def _generated_specs() -> Iterator[DatasetSpec]:
         yield _generated(f"{task}-expert-sb3", f"{task}-medium-expert-v2")
     # A slow run that was stopped at D4RL's number of rows without reaching "medium".
     yield _generated("hopper-replay-402k-sb3", "hopper-medium-replay-v2")
+    for task in ("pen", "hammer", "door", "relocate"):
+        yield _generated(f"{task}-expert-sb3", f"{task}-cloned-v0")
+        # 25 stochastic episodes of the expert, as many as there are demonstrations in the human sets.
+        yield _generated(f"{task}-noisyexpert25-sb3", f"{task}-human-v0")
     # The real demonstrations of door-human with observations and rewards recomputed.
     yield _generated("door-human-replayed-sb3", "door-human-v0")
 

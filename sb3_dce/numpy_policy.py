@@ -1,0 +1,406 @@
+"""
+Policies as plain NumPy in float64: fast for one observation at a time, and the same bits on every BLAS once rounded.
+
+Stable-Baselines3's ``predict`` costs several simulator steps per call. What can be expressed as an MLP is taken out of the
+PyTorch policy by :func:`numpy_policy`; the rest is wrapped by :class:`PredictPolicy`, which is slower. PyTorch is imported by
+the functions that need it only.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from sb3_dce.errors import ConfigError
+
+Layer = tuple[np.ndarray, np.ndarray]
+
+# Bounds of the log standard deviation of Stable-Baselines3's SAC actor.
+LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
+
+
+def _relu(x: np.ndarray) -> np.ndarray:
+    return np.maximum(x, 0.0, out=x)
+
+
+def _leaky_relu(x: np.ndarray) -> np.ndarray:
+    return np.where(x > 0.0, x, 0.01 * x)
+
+
+def _elu(x: np.ndarray) -> np.ndarray:
+    return np.where(x > 0.0, x, np.expm1(np.minimum(x, 0.0)))
+
+
+def _silu(x: np.ndarray) -> np.ndarray:
+    return x / (1.0 + np.exp(-x))
+
+
+# they may overwrite their argument
+ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "relu": _relu,
+    "tanh": np.tanh,
+    "elu": _elu,
+    "leaky_relu": _leaky_relu,
+    "silu": _silu,
+}
+
+
+class NumpyPolicy(ABC):
+    """
+    A policy for observations that are vectors and actions that are vectors in a box.
+
+    :param obs_dim: number of entries of an observation
+    :param low: smallest action, shape (act_dim,)
+    :param high: largest action, shape (act_dim,)
+    """
+
+    # whether the two ways of acting differ, and whether the policy can act without noise
+    is_stochastic = True
+    is_deterministic = True
+
+    def __init__(self, obs_dim: int, low: np.ndarray, high: np.ndarray) -> None:
+        self.obs_dim = obs_dim
+        self.low, self.high = (np.asarray(bound, dtype=np.float64).reshape(-1) for bound in (low, high))
+
+    @property
+    def act_dim(self) -> int:
+        """
+        :return: number of entries of an action
+        """
+        return len(self.low)
+
+    def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """
+        The noise of ``n`` actions. Drawing it at once or in parts gives the same numbers.
+
+        :param rng: generator
+        :param n: actions
+        :return: what :meth:`act` wants as ``noise``, shape (n, act_dim)
+        """
+        return rng.standard_normal((n, self.act_dim))
+
+    @abstractmethod
+    def act(self, obs: np.ndarray, noise: np.ndarray | None = None, step: int = 0) -> np.ndarray:
+        """
+        :param obs: shape (n, obs_dim)
+        :param noise: from :meth:`draw`, shape (n, act_dim); ``None`` for the deterministic action
+        :param step: steps since the start of the episode, for policies that see the time
+        :return: actions in the units of the environment, float64, shape (n, act_dim)
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class ObsNormalizer:
+    """
+    ``clip((s - mean) / scale, -clip, clip)``.
+
+    :param mean: shape (obs_dim,)
+    :param scale: shape (obs_dim,)
+    :param clip: largest absolute value, may be infinite
+    """
+
+    mean: np.ndarray
+    scale: np.ndarray
+    clip: float = np.inf
+
+    def __call__(self, obs: np.ndarray) -> np.ndarray:
+        """
+        :param obs: shape (n, obs_dim)
+        :return: shape (n, obs_dim)
+        """
+        normalized = (obs - self.mean) / self.scale
+        return np.minimum(np.maximum(normalized, -self.clip), self.clip)
+
+
+class MLPPolicy(NumpyPolicy):
+    """
+    A Gaussian policy with a multi-layer perceptron, squashed by tanh or clipped, or its mean alone.
+
+    :param layers: weight of shape (in, out) and bias of shape (out,) of each layer; the last one gives the mean
+    :param activation: key of :data:`ACTIVATIONS`, of all layers but the last
+    :param low: smallest action, shape (act_dim,)
+    :param high: largest action, shape (act_dim,)
+    :param squash: tanh, then from [-1, 1] to the box (SAC, TD3); otherwise clipped to the box (PPO)
+    :param log_std: of the Gaussian before squashing: a layer on the last hidden units, clipped to [-20, 2] as in SAC; or a
+        vector, as in PPO; ``None`` for a policy without noise of its own (TD3)
+    :param normalizer: applied to the observation, the time included
+    :param time_limit: steps after which the time feature ``1 - step / time_limit``, appended to the observation, is 0;
+        ``None`` for a policy that does not see the time
+    """
+
+    def __init__(
+        self,
+        layers: Sequence[Layer],
+        activation: str,
+        low: np.ndarray,
+        high: np.ndarray,
+        squash: bool,
+        log_std: Layer | np.ndarray | None = None,
+        normalizer: ObsNormalizer | None = None,
+        time_limit: int | None = None,
+    ) -> None:
+        super().__init__(len(layers[0][0]) - (time_limit is not None), low, high)
+        self.activation = activation
+        self.squash = squash
+        self.normalizer = normalizer
+        self.time_limit = time_limit
+        self.is_stochastic = log_std is not None
+        self.layers = [_float64(layer) for layer in layers]
+        self.log_std = log_std
+        self._hidden, self._mean = self.layers[:-1], self.layers[-1]
+        self._has_std_layer = isinstance(log_std, tuple)
+        if isinstance(log_std, tuple):
+            self.log_std = weight, bias = _float64(log_std)
+            # one product for mean and log std is faster than two
+            self._both = (np.ascontiguousarray(np.hstack([self._mean[0], weight])), np.concatenate([self._mean[1], bias]))
+        elif log_std is not None:
+            self._std = np.exp(np.asarray(log_std, dtype=np.float64))
+        if squash:
+            self._middle, self._half_range = (self.high + self.low) / 2, (self.high - self.low) / 2
+
+    def act(self, obs: np.ndarray, noise: np.ndarray | None = None, step: int = 0) -> np.ndarray:
+        mean, std = self.distribution(obs, step, with_std=noise is not None)
+        if noise is not None and std is not None:
+            mean = mean + std * noise
+        if self.squash:
+            return self._middle + self._half_range * np.tanh(mean)
+        return np.minimum(np.maximum(mean, self.low), self.high)
+
+    def distribution(self, obs: np.ndarray, step: int = 0, with_std: bool = True) -> tuple[np.ndarray, np.ndarray | None]:
+        """
+        The Gaussian before squashing or clipping.
+
+        :param obs: shape (n, obs_dim)
+        :param step: steps since the start of the episode
+        :param with_std: compute the standard deviation
+        :return: mean, shape (n, act_dim), and standard deviation, shape (n, act_dim) or (act_dim,); ``None`` without
+        """
+        x = np.asarray(obs, dtype=np.float64)
+        if self.time_limit is not None:
+            x = np.concatenate([x, np.full((len(x), 1), 1.0 - step / self.time_limit)], axis=1)
+        if self.normalizer is not None:
+            x = self.normalizer(x)
+        activation = ACTIVATIONS[self.activation]
+        for weight, bias in self._hidden:
+            x = x @ weight
+            x += bias
+            x = activation(x)
+        if not (with_std and self.is_stochastic):
+            return x @ self._mean[0] + self._mean[1], None
+        if not self._has_std_layer:
+            return x @ self._mean[0] + self._mean[1], self._std
+        both = x @ self._both[0] + self._both[1]
+        log_std = np.minimum(np.maximum(both[:, self.act_dim :], LOG_STD_MIN), LOG_STD_MAX)
+        return both[:, : self.act_dim], np.exp(log_std)
+
+
+class RandomPolicy(NumpyPolicy):
+    """
+    Uniform on the box of the actions.
+
+    :param obs_dim: number of entries of an observation
+    :param low: smallest action, shape (act_dim,)
+    :param high: largest action, shape (act_dim,)
+    :raises ConfigError: if the box is unbounded
+    """
+
+    is_deterministic = False
+
+    def __init__(self, obs_dim: int, low: np.ndarray, high: np.ndarray) -> None:
+        super().__init__(obs_dim, low, high)
+        if not np.isfinite([self.low, self.high]).all():
+            raise ConfigError(
+                "the random policy is uniform on the action space, and this one has no bounds",
+                key="policy",
+                hint="Wrap the environment with gymnasium.wrappers.RescaleAction, or record another policy.",
+            )
+
+    def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        return rng.uniform(self.low, self.high, (n, self.act_dim))
+
+    def act(self, obs: np.ndarray, noise: np.ndarray | None = None, step: int = 0) -> np.ndarray:
+        if noise is None:
+            raise ConfigError(
+                "the random policy has no deterministic action", key="deterministic", hint="Leave deterministic out."
+            )
+        return noise
+
+
+class PredictPolicy(NumpyPolicy):
+    """
+    Any policy of Stable-Baselines3, through its own ``predict``: for networks that are no plain MLP. Slower.
+
+    Its noise is PyTorch's, seeded anew for each action, so that it depends on nothing else.
+
+    :param load: returns the policy; called once per process, so that the object can be sent to others
+    :param obs_dim: number of entries of an observation
+    :param low: smallest action, shape (act_dim,)
+    :param high: largest action, shape (act_dim,)
+    :param normalizer: applied to the observation
+    """
+
+    def __init__(
+        self,
+        load: Callable[[], Any],
+        obs_dim: int,
+        low: np.ndarray,
+        high: np.ndarray,
+        normalizer: ObsNormalizer | None = None,
+    ) -> None:
+        super().__init__(obs_dim, low, high)
+        self._load, self.normalizer = load, normalizer
+        self._policy: Any = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_policy": None}
+
+    def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        return rng.integers(2**31, size=(n, 1))
+
+    def act(self, obs: np.ndarray, noise: np.ndarray | None = None, step: int = 0) -> np.ndarray:
+        if self._policy is None:
+            self._policy = self._load()
+        x = np.asarray(obs, dtype=np.float64)
+        if self.normalizer is not None:
+            x = self.normalizer(x)
+        x = x.astype(np.float32)
+        if noise is None:
+            return np.asarray(self._policy.predict(x, deterministic=True)[0], dtype=np.float64)
+        import torch as th
+
+        actions = []
+        for row, seed in zip(x, noise[:, 0], strict=True):
+            th.manual_seed(int(seed))
+            actions.append(self._policy.predict(row[np.newaxis], deterministic=False)[0])
+        return np.concatenate(actions).astype(np.float64)
+
+
+def numpy_policy(policy: Any, normalizer: ObsNormalizer | None = None) -> MLPPolicy | None:
+    """
+    The NumPy twin of a policy of Stable-Baselines3 or of this package.
+
+    Known are the MLP policies of SAC, TQC, TD3, DDPG, PPO, A2C and TRPO, and those of the offline agents, with their
+    standardised observations. Classes are compared exactly: a subclass may act in another way.
+
+    :param policy: ``model.policy``
+    :param normalizer: applied to the observation first, as ``VecNormalize`` does
+    :return: the twin; ``None`` if the policy cannot be expressed
+    """
+    spaces_fit = (
+        isinstance(policy.observation_space, spaces.Box)
+        and len(policy.observation_space.shape) == 1
+        and isinstance(policy.action_space, spaces.Box)
+        and len(policy.action_space.shape) == 1
+    )
+    parts = _actor_parts(policy) if spaces_fit else None
+    if parts is None:
+        return None
+    modules, log_std, extractor, squash = parts
+    extracted = _extractor_normalizer(extractor)
+    plain = _layers(modules)
+    if extracted is _UNKNOWN or plain is None or (extracted is not None and normalizer is not None):
+        return None
+    layers, activation = plain
+    low, high = policy.action_space.low, policy.action_space.high
+    return MLPPolicy(layers, activation, low, high, squash, log_std, extracted or normalizer)
+
+
+_UNKNOWN: Any = object()
+
+
+def _actor_parts(policy: Any) -> tuple[list[Any], Layer | np.ndarray | None, Any, bool] | None:
+    """Modules of the mean, log std, features extractor, and whether tanh follows; ``None`` for an unknown policy."""
+    from stable_baselines3.common.distributions import DiagGaussianDistribution
+    from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+    from stable_baselines3.common.torch_layers import MlpExtractor
+    from stable_baselines3.sac.policies import SACPolicy
+    from stable_baselines3.td3.policies import Actor as TD3Actor
+    from stable_baselines3.td3.policies import TD3Policy
+
+    known = (SACPolicy._predict, TD3Policy._predict, ActorCriticPolicy._predict, *_contrib())
+    if type(policy).predict is not BasePolicy.predict or type(policy)._predict not in known:
+        return None
+    actor: Any = getattr(policy, "actor", None)
+    if type(actor) in _squashed_gaussian_actors() and not actor.use_sde:
+        return [*actor.latent_pi, actor.mu], _layer(actor.log_std), actor.features_extractor, True
+    if type(actor) is TD3Actor and _is_tanh(actor.mu[-1]):
+        return list(actor.mu)[:-1], None, actor.features_extractor, True
+    if (
+        type(policy) is ActorCriticPolicy
+        and type(policy.mlp_extractor) is MlpExtractor
+        and type(policy.action_dist) is DiagGaussianDistribution
+    ):
+        modules = [*policy.mlp_extractor.policy_net, policy.action_net]
+        return modules, policy.log_std.detach().cpu().numpy(), policy.pi_features_extractor, False
+    return None
+
+
+def _squashed_gaussian_actors() -> tuple[type, ...]:
+    from stable_baselines3.sac.policies import Actor
+
+    from sb3_dce.networks import OfflineActor
+
+    actors: tuple[type, ...] = (Actor, OfflineActor)
+    try:
+        from sb3_contrib.tqc.policies import Actor as TQCActor
+    except ImportError:
+        return actors
+    return (*actors, TQCActor)
+
+
+def _contrib() -> tuple[Callable[..., Any], ...]:
+    try:
+        from sb3_contrib.tqc.policies import TQCPolicy
+    except ImportError:
+        return ()
+    return (TQCPolicy._predict,)
+
+
+def _extractor_normalizer(extractor: Any) -> Any:
+    from stable_baselines3.common.torch_layers import FlattenExtractor
+
+    from sb3_dce.networks import StandardizedExtractor
+
+    if type(extractor) is FlattenExtractor:
+        return None
+    if type(extractor) is StandardizedExtractor:
+        mean, std = (tensor.cpu().numpy().astype(np.float64) for tensor in (extractor.mean, extractor.std))
+        return ObsNormalizer(mean, std + extractor.eps)
+    return _UNKNOWN
+
+
+def _layers(modules: list[Any]) -> tuple[list[Layer], str] | None:
+    """Linear layers with one activation between them; ``None`` for any other order or kind of modules."""
+    from torch import nn
+
+    names: dict[type, str] = {nn.ReLU: "relu", nn.Tanh: "tanh", nn.ELU: "elu", nn.LeakyReLU: "leaky_relu", nn.SiLU: "silu"}
+    linear, between = modules[::2], modules[1::2]
+    kinds = {type(module) for module in between}
+    plain = all(getattr(m, "alpha", 1.0) == 1.0 and getattr(m, "negative_slope", 0.01) == 0.01 for m in between)
+    if len(linear) != len(between) + 1 or any(type(module) is not nn.Linear for module in linear):
+        return None
+    if len(kinds) > 1 or not kinds <= set(names) or not plain:
+        return None
+    return [_layer(module) for module in linear], names[kinds.pop()] if kinds else "relu"
+
+
+def _layer(linear: Any) -> Layer:
+    weight = linear.weight.detach().cpu().numpy()
+    bias = np.zeros(len(weight)) if linear.bias is None else linear.bias.detach().cpu().numpy()
+    return weight.T, bias
+
+
+def _is_tanh(module: Any) -> bool:
+    from torch import nn
+
+    return type(module) is nn.Tanh
+
+
+def _float64(layer: Layer) -> Layer:
+    weight, bias = (np.ascontiguousarray(array, dtype=np.float64) for array in layer)
+    return weight, bias
