@@ -12,16 +12,17 @@ import numpy as np
 import torch as th
 from rich.console import Console
 from rich.table import Table
-from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_dce.data import load_transitions
-from sb3_dce.data.catalog import normalized_score
+from sb3_dce.data.catalog import normalized_score, resolve
+from sb3_dce.envs import dataset_spaces
 from sb3_dce.errors import ConfigError
-from sb3_dce.evaluation import make_eval_env, read_evaluations
+from sb3_dce.evaluation import make_rollouts, read_evaluations
 from sb3_dce.execution import choose_execution
 from sb3_dce.files import write_atomically
 from sb3_dce.launch import launch
 from sb3_dce.plots import plot_learning_curves
+from sb3_dce.rollouts import Rollouts
 from sb3_dce.runs import RunSpec
 
 DATASET = "halfcheetah-demo-sb3"
@@ -61,8 +62,8 @@ def run_demo(folder: Path, n_seeds: int, fresh: bool, console: Console) -> dict[
     transitions = load_transitions(DATASET)
     for line in transitions.summary():
         console.print(line, markup=False)
-    env = make_eval_env(DATASET, N_EVAL_EPISODES)
-    if env is None:
+    rollouts = make_rollouts(DATASET, N_EVAL_EPISODES)
+    if rollouts is None:
         raise ConfigError("the demo evaluates in MuJoCo, which is not installed", key="mujoco", hint="pip install mujoco")
     if choose_execution("auto", N_UPDATES, th.device("cpu")) == "eager":
         n_seeds = 1
@@ -74,7 +75,7 @@ def run_demo(folder: Path, n_seeds: int, fresh: bool, console: Console) -> dict[
     )
     results = launch(sorted(specs, key=lambda s: s.algo), os.cpu_count() or 1, console)
     table = {
-        "random": _random_returns(env),
+        "random": _random_returns(rollouts),
         "data": transitions.info.episode_returns.tolist(),
         **{name: _means(results, algo) for name, algo in (("BC", "offline_bc"), ("DCE", "dce"))},
     }
@@ -103,17 +104,11 @@ def _delete_demo(folder: Path) -> None:
             path.unlink()
 
 
-def _random_returns(env: DummyVecEnv) -> list[float]:
+def _random_returns(rollouts: Rollouts) -> list[float]:
     """Return of one episode per environment with uniform actions."""
-    env.seed(0)
-    env.action_space.seed(0)
-    env.reset()
-    totals, running = np.zeros(env.num_envs), np.ones(env.num_envs, dtype=bool)
-    while running.any():
-        _, rewards, dones, _ = env.step(np.stack([env.action_space.sample() for _ in range(env.num_envs)]))
-        totals += rewards * running
-        running &= ~dones
-    return totals.tolist()
+    space = dataset_spaces(resolve(DATASET))[1]
+    space.seed(0)
+    return list(rollouts.play(lambda obs: np.stack([space.sample() for _ in obs]), seed=0).returns)
 
 
 def _means(results: list[dict[str, Any]], algo: str) -> list[float]:

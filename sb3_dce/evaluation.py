@@ -10,14 +10,13 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv
 
+from sb3_dce.checks import check_number
 from sb3_dce.data.catalog import normalized_score, resolve
-from sb3_dce.envs import SpacesEnv, make_env_if_possible
-from sb3_dce.errors import ConfigError, DatasetError
+from sb3_dce.envs import make_env_if_possible, missing_simulator
+from sb3_dce.errors import DatasetError
 from sb3_dce.files import write_atomically
+from sb3_dce.rollouts import Rollouts, deterministic_act
 
 # Seeds of two evaluations must not overlap; no evaluation has more episodes than this.
 SEEDS_PER_EVALUATION = 10_000
@@ -74,36 +73,30 @@ def catalogue_id(dataset: str | None) -> str | None:
         return None
 
 
-def make_eval_env(dataset_id: str, n_episodes: int) -> DummyVecEnv | None:
+def make_rollouts(dataset_id: str, n_episodes: int) -> Rollouts | None:
     """
-    One environment per episode, so that short episodes are not over-represented.
-
     :param dataset_id: id of the catalogue
-    :param n_episodes: number of environments
-    :return: vectorised environment, or ``None`` where the simulator is not installed
+    :param n_episodes: episodes of an evaluation
+    :return: environments to evaluate in, or ``None`` where there is no simulator
     """
-    if isinstance(make_env_if_possible(dataset_id).unwrapped, SpacesEnv):
+    if missing_simulator(resolve(dataset_id)) is not None:
         return None
-    return DummyVecEnv([lambda: Monitor(make_env_if_possible(dataset_id)) for _ in range(n_episodes)])
+    return Rollouts(lambda: make_env_if_possible(dataset_id), n_episodes)
 
 
-def evaluate(model: Any, env: DummyVecEnv, n_episodes: int, seed: int, dataset_id: str | None = None) -> Evaluation:
+def evaluate(model: Any, rollouts: Rollouts, seed: int, dataset_id: str | None = None) -> Evaluation:
     """
-    Deterministic episodes with fixed seeds.
+    Deterministic episodes with fixed seeds: the returns of ``evaluate_policy`` on a ``DummyVecEnv`` with as many
+    environments as episodes, seeded with ``seed``.
 
-    :param model: anything with ``predict``; its ``_n_updates`` is recorded if it has one
-    :param env: vectorised environment
-    :param n_episodes: episodes
+    :param model: agent; its ``_n_updates`` is recorded if it has one
+    :param rollouts: environments
     :param seed: seed of the first environment
     :param dataset_id: defines the score
     :return: returns and lengths
     """
-    env.seed(seed)
-    returns, lengths = evaluate_policy(
-        model, env, n_eval_episodes=n_episodes, deterministic=True, return_episode_rewards=True, warn=False
-    )
-    assert isinstance(returns, list) and isinstance(lengths, list)
-    return Evaluation(int(getattr(model, "_n_updates", 0)), tuple(map(float, returns)), tuple(map(int, lengths)), dataset_id)
+    episodes = rollouts.play(deterministic_act(model), seed)
+    return Evaluation(int(getattr(model, "_n_updates", 0)), *episodes, dataset_id)
 
 
 class EvaluationCallback(BaseCallback):
@@ -114,10 +107,9 @@ class EvaluationCallback(BaseCallback):
     touched: a run gives the same weights with and without evaluation, and the same evaluations after a resume. There is
     no "best model": choosing one by online evaluation is not an offline result.
 
-    :param env: vectorised environment; ``None`` evaluates nothing
+    :param rollouts: environments, one per episode; ``None`` evaluates nothing
     :param dataset_id: defines the score
     :param eval_freq: gradient steps between two evaluations
-    :param n_eval_episodes: episodes of each
     :param seed: seed of the run
     :param folder: where the files are written; earlier evaluations found there are kept
     :param on_evaluation: called with each outcome
@@ -126,26 +118,19 @@ class EvaluationCallback(BaseCallback):
 
     def __init__(
         self,
-        env: DummyVecEnv | None,
+        rollouts: Rollouts | None,
         dataset_id: str | None,
         eval_freq: int,
-        n_eval_episodes: int = 10,
         seed: int = 0,
         folder: Path | None = None,
         on_evaluation: Callable[[Evaluation], None] | None = None,
         save_checkpoint: bool = False,
     ) -> None:
         super().__init__()
-        if eval_freq < 1 or n_eval_episodes < 1:
-            raise ConfigError(
-                f"eval_freq and the number of episodes must be at least 1, got {eval_freq} and {n_eval_episodes}",
-                key="eval_freq",
-                hint="Use 5000 and 10.",
-            )
-        self.env = env
+        check_number("eval_freq", eval_freq, 1, integer=True, hint="The paper uses 5000.")
+        self.rollouts = rollouts
         self.dataset_id = dataset_id
         self.eval_freq = eval_freq
-        self.n_eval_episodes = n_eval_episodes
         self.seed = seed
         self.folder = folder
         self.on_evaluation = on_evaluation
@@ -154,16 +139,16 @@ class EvaluationCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         if self.num_timesteps % self.eval_freq == 0:
-            if self.env is not None:
-                self._evaluate(self.env)
+            if self.rollouts is not None:
+                self._evaluate(self.rollouts)
             if self.save_checkpoint and self.folder is not None:
                 self.model.save(self.folder / "checkpoint.zip")
         return True
 
-    def _evaluate(self, env: DummyVecEnv) -> None:
+    def _evaluate(self, rollouts: Rollouts) -> None:
         index = self.num_timesteps // self.eval_freq
         seed = SEEDS_PER_EVALUATION * (index + 1000 * self.seed)
-        outcome = evaluate(self.model, env, self.n_eval_episodes, seed, self.dataset_id)
+        outcome = evaluate(self.model, rollouts, seed, self.dataset_id)
         kept = [e for e in self.evaluations if e.n_updates < outcome.n_updates]
         self.evaluations = [*kept, outcome]
         self.logger.record("eval/mean_reward", outcome.mean)

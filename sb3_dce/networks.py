@@ -38,8 +38,36 @@ class KeepDtype:
         return next(self.parameters()).dtype  # type: ignore[attr-defined]
 
 
+def masked_mlp(net: nn.Module, hidden: th.Tensor, masks: Sequence[th.Tensor], activation_fn: type[nn.Module]) -> th.Tensor:
+    """
+    Run a sequence of layers with dropout after each activation.
+
+    :param net: layers
+    :param hidden: inputs, shape (batch, width)
+    :param masks: per activation a factor of shape (batch, width): 0, or 1 / (1 - dropout)
+    :param activation_fn: class of the activations
+    :return: outputs of the last layer
+    """
+    remaining = iter(masks)
+    for layer in net.children():
+        hidden = layer(hidden)
+        if isinstance(layer, activation_fn):
+            hidden = hidden * next(remaining)
+    return hidden
+
+
 class OfflineActor(KeepDtype, Actor):
     """Stable-Baselines3's SAC actor; its state dict is the same."""
+
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        """
+        :param obs: shape (batch, *obs_shape)
+        :param deterministic: without noise; then no distribution is made, which takes longer than the network
+        :return: actions in [-1, 1], shape (batch, action_dim)
+        """
+        if not deterministic:
+            return super().forward(obs)
+        return th.tanh(self.mu(self.latent_pi(self.extract_features(obs, self.features_extractor))))
 
 
 class OfflineCritic(KeepDtype, ContinuousCritic):
@@ -105,15 +133,10 @@ class OfflineCritic(KeepDtype, ContinuousCritic):
         inputs = th.cat([features, actions], dim=-1)
         if masks is None:
             return tuple(q_net(inputs) for q_net in self.q_networks)
-        return tuple(self._masked(q_net, inputs, net_masks) for q_net, net_masks in zip(self.q_networks, masks, strict=True))
-
-    def _masked(self, q_net: nn.Module, hidden: th.Tensor, masks: Sequence[th.Tensor]) -> th.Tensor:
-        remaining = iter(masks)
-        for layer in q_net.children():
-            hidden = layer(hidden)
-            if isinstance(layer, self.activation_fn):
-                hidden = hidden * next(remaining)
-        return hidden
+        return tuple(
+            masked_mlp(q_net, inputs, net_masks, self.activation_fn)
+            for q_net, net_masks in zip(self.q_networks, masks, strict=True)
+        )
 
 
 class ValueNet(KeepDtype, BaseModel):

@@ -24,7 +24,7 @@ from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.data import find_file
 from sb3_dce.data.hashes import file_sha256
 from sb3_dce.errors import ConfigError
-from sb3_dce.evaluation import Evaluation, EvaluationCallback, catalogue_id, make_eval_env, write_evaluations
+from sb3_dce.evaluation import Evaluation, EvaluationCallback, catalogue_id, make_rollouts, write_evaluations
 from sb3_dce.files import write_atomically
 
 # Seconds between two progress reports.
@@ -113,9 +113,9 @@ def run(spec: RunSpec, report: Report = lambda progress: None) -> dict[str, Any]
     def on_evaluation(outcome: Evaluation) -> None:
         report(Progress(spec.name, model.num_timesteps, spec.n_updates, outcome))
 
-    env = None if dataset_id is None else make_eval_env(dataset_id, spec.n_eval_episodes)
+    rollouts = None if dataset_id is None else make_rollouts(dataset_id, spec.n_eval_episodes)
     evaluating = EvaluationCallback(
-        env, dataset_id, spec.eval_freq, spec.n_eval_episodes, spec.seed, folder, on_evaluation, save_checkpoint=True
+        rollouts, dataset_id, spec.eval_freq, spec.seed, folder, on_evaluation, save_checkpoint=True
     )
     evaluating.evaluations = [e for e in evaluating.evaluations if e.n_updates <= model.num_timesteps]
     started, seconds_before = time.monotonic(), _seconds_before(folder)

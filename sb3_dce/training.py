@@ -17,7 +17,7 @@ from sb3_dce.data import find_file
 from sb3_dce.data.catalog import resolve
 from sb3_dce.envs import missing_simulator
 from sb3_dce.errors import CheckpointError, ConfigError
-from sb3_dce.evaluation import Evaluation, catalogue_id, evaluate, make_eval_env, read_evaluations
+from sb3_dce.evaluation import Evaluation, catalogue_id, evaluate, make_rollouts, read_evaluations
 from sb3_dce.launch import launch
 from sb3_dce.plots import plot_learning_curves
 from sb3_dce.runs import RunSpec
@@ -115,9 +115,9 @@ def evaluate_file(model_path: Path, dataset: str | None, n_episodes: int, seed: 
     missing = missing_simulator(resolve(dataset_id))
     if missing is not None:
         raise ConfigError(missing.reason, key="env", hint=missing.remedy)
-    env = make_eval_env(dataset_id, n_episodes)
-    assert env is not None
-    return evaluate(model, env, n_episodes, seed, dataset_id)
+    rollouts = make_rollouts(dataset_id, n_episodes)
+    assert rollouts is not None
+    return evaluate(model, rollouts, seed, dataset_id)
 
 
 def load_any(path: Path) -> OfflineAlgorithm:
