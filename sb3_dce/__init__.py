@@ -16,15 +16,38 @@ from sb3_dce.envs import register_envs
 
 if TYPE_CHECKING:
     from sb3_dce.bc import OfflineBC
+    from sb3_dce.cql import OfflineCQL
     from sb3_dce.dce import OfflineDCE
+    from sb3_dce.dce_variants import OfflineCQLEq18, OfflineSACV
+    from sb3_dce.iql import OfflineIQL
+    from sb3_dce.pbrl import OfflinePBRL
+    from sb3_dce.sac import OfflineSAC
+    from sb3_dce.td3_bc import OfflineTD3BC
 
 __version__ = "0.1.0"
 
-_AGENTS = {"OfflineBC": "sb3_dce.bc", "OfflineDCE": "sb3_dce.dce"}
+_AGENTS = {
+    "OfflineBC": "sb3_dce.bc",
+    "OfflineCQL": "sb3_dce.cql",
+    "OfflineCQLEq18": "sb3_dce.dce_variants",
+    "OfflineDCE": "sb3_dce.dce",
+    "OfflineIQL": "sb3_dce.iql",
+    "OfflinePBRL": "sb3_dce.pbrl",
+    "OfflineSAC": "sb3_dce.sac",
+    "OfflineSACV": "sb3_dce.dce_variants",
+    "OfflineTD3BC": "sb3_dce.td3_bc",
+}
 
 __all__ = [
     "OfflineBC",
+    "OfflineCQL",
+    "OfflineCQLEq18",
     "OfflineDCE",
+    "OfflineIQL",
+    "OfflinePBRL",
+    "OfflineSAC",
+    "OfflineSACV",
+    "OfflineTD3BC",
     "Transitions",
     "__version__",
     "load_dataset",

@@ -5,10 +5,23 @@ from __future__ import annotations
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.bc import OfflineBC
 from sb3_dce.dce import OfflineDCE
+from sb3_dce.dce_variants import OfflineCQLEq18, OfflineSACV
 from sb3_dce.errors import ConfigError
 from sb3_dce.hyperparams import did_you_mean
+from sb3_dce.iql import OfflineIQL
+from sb3_dce.sac import OfflineSAC
+from sb3_dce.td3_bc import OfflineTD3BC
 
-AGENTS: dict[str, type[OfflineAlgorithm]] = {agent.algo_name: agent for agent in (OfflineDCE, OfflineBC)}
+_CLASSES: tuple[type[OfflineAlgorithm], ...] = (
+    OfflineDCE,
+    OfflineBC,
+    OfflineTD3BC,
+    OfflineIQL,
+    OfflineSAC,
+    OfflineSACV,
+    OfflineCQLEq18,
+)
+AGENTS: dict[str, type[OfflineAlgorithm]] = {agent.algo_name: agent for agent in _CLASSES}
 
 
 def agent_class(algo: str) -> type[OfflineAlgorithm]:

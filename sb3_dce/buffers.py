@@ -90,11 +90,12 @@ class OfflineReplayBuffer(ReplayBuffer):
         if self.rows is not None:
             self.rows = self.rows.to(self._device)
 
-    def attach(self, transitions: Transitions) -> None:
+    def attach(self, transitions: Transitions, row_numbers: np.ndarray | None = None) -> None:
         """
-        Take over a dataset: on a CPU without a copy, unless its actions have to be rescaled to [-1, 1].
+        Take over a dataset: on a CPU without a copy, unless its actions have to be rescaled to [-1, 1] or rows are chosen.
 
         :param transitions: dataset with this buffer's observation and action widths
+        :param row_numbers: the rows that are taken; ``None`` takes all
         :raises DatasetFormatError: if the widths differ
         :raises DatasetSemanticsError: if actions lie outside of this buffer's action space
         """
@@ -107,9 +108,11 @@ class OfflineReplayBuffer(ReplayBuffer):
                 hint="Use the environment the data were recorded in, or another dataset.",
             )
         self._refuse_actions_outside(transitions)
-        rows = th.from_numpy(transitions._base_rows)
+        rows, timeouts = th.from_numpy(transitions._base_rows), transitions.timeouts
+        if row_numbers is not None:
+            rows, timeouts = rows[th.from_numpy(row_numbers)], timeouts[row_numbers]
         self.rows = self._with_scaled_actions(rows).to(self._device)
-        self._timeouts = transitions.timeouts
+        self._timeouts = timeouts
         self.buffer_size, self.pos, self.full = len(rows), 0, True
 
     def _refuse_actions_outside(self, transitions: Transitions) -> None:

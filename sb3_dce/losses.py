@@ -208,3 +208,142 @@ def bc_nll(mean: th.Tensor, log_std: th.Tensor, actions: th.Tensor) -> th.Tensor
     noise = (th.atanh(actions) - mean) / log_std.exp()
     _, log_prob = squashed_gaussian(mean, log_std, noise)
     return -batch_mean(log_prob)
+
+
+def gaussian_log_prob(mean: th.Tensor, log_std: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """
+    Log-density of independent Gaussians, nats. Nothing is squashed.
+
+    :param mean: shape (..., batch, action_dim)
+    :param log_std: shape (..., batch, action_dim), or (action_dim,) if it is the same in every state
+    :param actions: shape (..., batch, action_dim)
+    :return: shape (..., batch, 1)
+    """
+    noise = (actions - mean) / log_std.exp()
+    return (-0.5 * noise.square() - log_std - 0.5 * math.log(2.0 * math.pi)).sum(dim=-1, keepdim=True)
+
+
+def advantage_weights(advantages: th.Tensor, temperature: float | th.Tensor, max_weight: float | th.Tensor) -> th.Tensor:
+    """
+    ``min(exp(temperature * A), max_weight)`` of IQL (Kostrikov et al., 2021, Eq. 7).
+
+    :param advantages: Q(s, a) - V(s), shape (..., batch, 1), reward units
+    :param temperature: inverse temperature; 0 clones the behaviour, larger values prefer the better actions
+    :param max_weight: largest weight, 100 in the authors' code
+    :return: shape (..., batch, 1)
+    """
+    weights = (temperature * advantages).exp()
+    return th.minimum(weights, th.as_tensor(max_weight, dtype=weights.dtype, device=weights.device))
+
+
+def awr_loss(log_prob: th.Tensor, weights: th.Tensor) -> th.Tensor:
+    """
+    Advantage-weighted regression: ``-mean(w * log pi(a|s))`` (IQL, Eq. 7).
+
+    :param log_prob: of the actions of the data, shape (..., batch, 1), nats
+    :param weights: without gradient, shape (..., batch, 1)
+    :return: shape (...)
+    """
+    return -batch_mean(weights * log_prob)
+
+
+def td3bc_lambda(q_values_pi: th.Tensor, alpha: float | th.Tensor) -> th.Tensor:
+    """
+    ``alpha / mean |Q|``, the factor by which TD3+BC scales the critic to the clone (Fujimoto & Gu, 2021, Eq. 5).
+
+    :param q_values_pi: Q_1(s, pi(s)), shape (..., batch, 1), reward units
+    :param alpha: weight of the critic against the clone; the authors use 2.5
+    :return: without gradient, shape (...)
+    """
+    return alpha / batch_mean(q_values_pi.abs()).detach()
+
+
+def td3bc_actor_loss(q_values_pi: th.Tensor, actions_pi: th.Tensor, actions: th.Tensor, alpha: float | th.Tensor) -> th.Tensor:
+    """
+    ``-lambda * mean Q_1(s, pi(s)) + mean((pi(s) - a)^2)`` of TD3+BC (Fujimoto & Gu, 2021, Eq. 3).
+
+    :param q_values_pi: Q_1(s, pi(s)), shape (..., batch, 1), reward units
+    :param actions_pi: pi(s), shape (..., batch, action_dim)
+    :param actions: actions of the data, shape (..., batch, action_dim)
+    :param alpha: weight of the critic against the clone
+    :return: shape (...)
+    """
+    return bc_mse(actions_pi, actions) - td3bc_lambda(q_values_pi, alpha) * batch_mean(q_values_pi)
+
+
+def smoothed_actions(
+    actions: th.Tensor, noise: th.Tensor, noise_std: float | th.Tensor, noise_clip: float | th.Tensor
+) -> th.Tensor:
+    """
+    Target policy smoothing of TD3: ``clip(a + clip(noise_std * noise, -c, c), -1, 1)`` (Fujimoto et al., 2018, Eq. 14).
+
+    :param actions: of the target policy in [-1, 1], shape (..., batch, action_dim)
+    :param noise: standard normal, shape (..., batch, action_dim)
+    :param noise_std: standard deviation, in units of half the action range
+    :param noise_clip: largest change of an action
+    :return: shape (..., batch, action_dim)
+    """
+    bound = th.as_tensor(noise_clip, dtype=noise.dtype, device=noise.device)
+    return (actions + (noise_std * noise).clamp(-bound, bound)).clamp(-1.0, 1.0)
+
+
+def entropy_td_target(
+    rewards: th.Tensor,
+    dones: th.Tensor,
+    next_values: th.Tensor,
+    next_log_prob: th.Tensor,
+    ent_coef: th.Tensor,
+    gamma: float | th.Tensor,
+) -> th.Tensor:
+    """
+    SAC's target ``r + gamma * (1 - d) * (Q(s', a') - alpha * log pi(a'|s'))`` (Haarnoja et al., 2018, Eqs. 2 and 3).
+
+    :param rewards: shape (..., batch, 1), reward units
+    :param dones: shape (..., batch, 1), 1 only at true terminals
+    :param next_values: reduced over the target critics at a' ~ pi(s'), shape (..., batch, 1)
+    :param next_log_prob: log pi(a'|s'), shape (..., batch, 1), nats
+    :param ent_coef: temperature alpha, shape (...) or (1,)
+    :param gamma: discount factor in [0, 1]
+    :return: shape (..., batch, 1), reward units
+    """
+    return td_target(rewards, dones, next_values - ent_coef * next_log_prob, gamma)
+
+
+def cql_gap(q_values: th.Tensor, q_values_sampled: th.Tensor, log_densities: th.Tensor) -> th.Tensor:
+    """
+    ``mean(log sum_a' exp(Q(s, a') - log density(a'))) - mean(Q(s, a))``: the regulariser of CQL(H) with importance sampling
+    (Kumar et al., 2020), without its weight.
+
+    :param q_values: Q(s, a) of the data, shape (..., batch, 1), reward units
+    :param q_values_sampled: Q(s, a') of sampled actions, shape (..., n_actions, batch, 1)
+    :param log_densities: log-density each a' was drawn with, without gradient, shape (n_actions, batch, 1), nats
+    :return: shape (...)
+    """
+    return batch_mean(th.logsumexp(q_values_sampled - log_densities, dim=-3)) - batch_mean(q_values)
+
+
+def ensemble_std(q_values: th.Tensor) -> th.Tensor:
+    """
+    Disagreement of an ensemble: standard deviation over its members with divisor n - 1 (Bai et al., 2022).
+
+    :param q_values: shape (..., n_critics, batch, 1), reward units
+    :return: shape (..., 1, batch, 1), reward units
+    """
+    return q_values.std(dim=-3, keepdim=True)
+
+
+def pessimistic_values(
+    q_values: th.Tensor, uncertainty: th.Tensor, weight: float | th.Tensor, floor: float | None = None
+) -> th.Tensor:
+    """
+    ``max(Q - weight * uncertainty, floor)``: PBRL's next values (without floor) and its pseudo-targets of actions outside
+    the data (floor 0; Bai et al., 2022).
+
+    :param q_values: shape (..., n_critics, batch, 1), reward units
+    :param uncertainty: shape (..., 1, batch, 1), reward units
+    :param weight: weight of the uncertainty, at least 0
+    :param floor: smallest value, reward units; ``None`` is off
+    :return: shape (..., n_critics, batch, 1)
+    """
+    lowered = q_values - weight * uncertainty
+    return lowered if floor is None else lowered.clamp(min=floor)

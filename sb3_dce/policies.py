@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from functools import partial
+from typing import Any, TypeVar
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, get_actor_critic_arch
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
 
+from sb3_dce.actors import DeterministicActor, GaussianActor
 from sb3_dce.errors import ConfigError
 from sb3_dce.networks import OfflineActor, OfflineCritic, ValueNet
+
+Net = TypeVar("Net", bound=nn.Module)
 
 
 class OfflineSACPolicy(SACPolicy):
@@ -163,6 +168,52 @@ class ActorPolicy(OfflineSACPolicy):
         """
         self.actor.set_training_mode(mode)
         self.training = mode
+
+
+class OfflineTD3Policy(OfflineSACPolicy):
+    """The same policy with a deterministic actor that has a target; parameters as :class:`OfflineSACPolicy`."""
+
+    actor: DeterministicActor  # type: ignore[assignment]
+    actor_target: DeterministicActor
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        super()._build(lr_schedule)
+        self.actor_target = self.make_actor()
+        self.actor_target.load_state_dict(self.actor.state_dict())
+        self.actor_target.set_training_mode(False)
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> DeterministicActor:  # type: ignore[override]
+        return DeterministicActor(**self._update_features_extractor(self.net_args, features_extractor)).to(self.device)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self.actor(observation)
+
+
+class OfflineIQLPolicy(OfflineSACPolicy):
+    """
+    The same policy with an actor that is a plain Gaussian, and with the orthogonal start (gain sqrt(2), no biases) of IQL's
+    authors; parameters as :class:`OfflineSACPolicy`.
+    """
+
+    actor: GaussianActor  # type: ignore[assignment]
+    value_net: ValueNet
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> GaussianActor:  # type: ignore[override]
+        actor = GaussianActor(**self._update_features_extractor(self.net_args, features_extractor))
+        return _orthogonal(actor).to(self.device)
+
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
+        return _orthogonal(super().make_critic(features_extractor))
+
+    def make_value_net(self) -> ValueNet:
+        """
+        :return: a new state-value network with the critics' hidden layers
+        """
+        return _orthogonal(super().make_value_net())
+
+
+def _orthogonal(net: Net) -> Net:
+    return net.apply(partial(BasePolicy.init_weights, gain=math.sqrt(2.0)))
 
 
 def _refuse_batch_norm(policy: nn.Module) -> None:

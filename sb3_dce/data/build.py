@@ -133,6 +133,7 @@ def build_rows(
         episodes=int(whole.sum()),
         episode_returns=returns[whole],
         episode_lengths=episodes.lengths[whole],
+        episode_numbers=np.flatnonzero(whole),
         n_terminals=int(terminals.sum()),
         n_timeouts=int(episodes.timeouts.sum()),
         open_last_episode=episodes.open_last,

@@ -123,6 +123,7 @@ class DatasetInfo:
     :param episode_returns: undiscounted return of each whole episode (reward units) before any row was dropped, float64; an
         episode that is open at the end of the file, or that lost rows with NaN or infinity, is not among them
     :param episode_lengths: rows of each of these episodes
+    :param episode_numbers: number of each of these episodes, as in ``Transitions.episodes``
     :param n_terminals: rows at which a task truly ended
     :param n_timeouts: rows at which a time limit ended an episode
     :param open_last_episode: whether the file ends in the middle of an episode
@@ -148,6 +149,7 @@ class DatasetInfo:
     episodes: int
     episode_returns: np.ndarray
     episode_lengths: np.ndarray
+    episode_numbers: np.ndarray
     n_terminals: int
     n_timeouts: int
     open_last_episode: bool

@@ -28,10 +28,9 @@ def sample_dce_params(trial: optuna.Trial, n_actions: int, n_envs: int, addition
     return convert_dce_params(
         {
             **_sample_optimizer(trial),
+            **_sample_bootstrap(trial),
             "beta": trial.suggest_float("beta", 0.03, 30.0, log=True),
             "expectile": trial.suggest_float("expectile", 0.5, 0.95),
-            "one_minus_gamma": trial.suggest_float("one_minus_gamma", 1e-3, 3e-2, log=True),
-            "tau": trial.suggest_float("tau", 1e-3, 2e-2, log=True),
         }
     )
 
@@ -41,9 +40,7 @@ def convert_dce_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     :param sampled_params: parameters of a trial, as drawn by :func:`sample_dce_params`
     :return: constructor keywords; a schedule in the row is switched off, since it belongs to another start value
     """
-    params = convert_bc_params(sampled_params)
-    params["gamma"] = 1.0 - params.pop("one_minus_gamma")
-    return {**params, "beta_final": None, "beta_rate": 0.0}
+    return {**convert_critic_params(sampled_params), "beta_final": None, "beta_rate": 0.0}
 
 
 def sample_bc_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
@@ -69,6 +66,105 @@ def convert_bc_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     return params
 
 
+def sample_td3bc_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    Draw hyperparameters of TD3+BC; see :func:`sample_dce_params`.
+
+    :param trial: trial of the search
+    :param n_actions: unused
+    :param n_envs: unused
+    :param additional_args: unused
+    :return: constructor keywords
+    """
+    drawn = {
+        **_sample_optimizer(trial),
+        **_sample_bootstrap(trial),
+        "alpha": trial.suggest_float("alpha", 0.1, 20.0, log=True),
+    }
+    return convert_critic_params(drawn)
+
+
+def sample_iql_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    Draw hyperparameters of IQL; see :func:`sample_dce_params`.
+
+    :param trial: trial of the search
+    :param n_actions: unused
+    :param n_envs: unused
+    :param additional_args: unused
+    :return: constructor keywords
+    """
+    return convert_critic_params(
+        {
+            **_sample_optimizer(trial),
+            **_sample_bootstrap(trial),
+            "expectile": trial.suggest_float("expectile", 0.5, 0.95),
+            "temperature": trial.suggest_float("temperature", 0.1, 20.0, log=True),
+            "actor_dropout": trial.suggest_float("actor_dropout", 0.0, 0.3),
+        }
+    )
+
+
+def sample_sac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    Draw hyperparameters of SAC on a dataset; see :func:`sample_dce_params`.
+
+    :param trial: trial of the search
+    :param n_actions: unused
+    :param n_envs: unused
+    :param additional_args: unused
+    :return: constructor keywords
+    """
+    return convert_critic_params({**_sample_optimizer(trial), **_sample_bootstrap(trial)})
+
+
+def sample_sac_v_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    Draw hyperparameters of SAC with V; see :func:`sample_dce_params`.
+
+    :param trial: trial of the search
+    :param n_actions: unused
+    :param n_envs: unused
+    :param additional_args: unused
+    :return: constructor keywords
+    """
+    drawn = {**_sample_optimizer(trial), **_sample_bootstrap(trial)}
+    return convert_critic_params({**drawn, "expectile": trial.suggest_float("expectile", 0.5, 0.95)})
+
+
+def sample_cql_eq18_params(
+    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
+) -> dict[str, Any]:
+    """
+    Draw hyperparameters of the paper's Eq. 18 agent; see :func:`sample_dce_params`.
+
+    :param trial: trial of the search
+    :param n_actions: unused
+    :param n_envs: unused
+    :param additional_args: unused
+    :return: constructor keywords
+    """
+    drawn = {**_sample_optimizer(trial), **_sample_bootstrap(trial)}
+    return convert_critic_params({**drawn, "beta": trial.suggest_float("beta", 0.03, 30.0, log=True)})
+
+
+def convert_critic_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param sampled_params: parameters of a trial of an agent with critics
+    :return: constructor keywords
+    """
+    params = convert_bc_params(sampled_params)
+    params["gamma"] = 1.0 - params.pop("one_minus_gamma")
+    return params
+
+
+def _sample_bootstrap(trial: optuna.Trial) -> dict[str, Any]:
+    return {
+        "one_minus_gamma": trial.suggest_float("one_minus_gamma", 1e-3, 3e-2, log=True),
+        "tau": trial.suggest_float("tau", 1e-3, 2e-2, log=True),
+    }
+
+
 def _sample_optimizer(trial: optuna.Trial) -> dict[str, Any]:
     return {
         "learning_rate": trial.suggest_float("learning_rate", 1e-4, 1e-3, log=True),
@@ -79,10 +175,20 @@ def _sample_optimizer(trial: optuna.Trial) -> dict[str, Any]:
 SAMPLERS: dict[str, Callable[..., dict[str, Any]]] = {
     "dce": sample_dce_params,
     "offline_bc": sample_bc_params,
+    "offline_td3bc": sample_td3bc_params,
+    "offline_iql": sample_iql_params,
+    "offline_sac": sample_sac_params,
+    "sac_v": sample_sac_v_params,
+    "cql_eq18": sample_cql_eq18_params,
 }
 CONVERTERS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "dce": convert_dce_params,
     "offline_bc": convert_bc_params,
+    "offline_td3bc": convert_critic_params,
+    "offline_iql": convert_critic_params,
+    "offline_sac": convert_critic_params,
+    "sac_v": convert_critic_params,
+    "cql_eq18": convert_critic_params,
 }
 
 
