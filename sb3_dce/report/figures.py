@@ -204,7 +204,7 @@ def _returns_over_file(transitions: Transitions) -> Plot:
         "A rising line is the replay buffer of a learning agent; steps are files joined together; a flat band is one policy."
     )
     if every > 1:
-        caption += f" Each {every}th episode is drawn."
+        caption += f" One point in {every} is drawn."
     return Plot("Return over the file", _svg(figure, "Return over the file"), caption)
 
 
@@ -324,7 +324,7 @@ def _show_density(axes: Axes, density: np.ndarray, spans: list[tuple[float, floa
     from matplotlib.colors import LinearSegmentedColormap
 
     hue = LinearSegmentedColormap.from_list(
-        "density", [(0.45, 0.6, 0.95, 0.25), (0.2, 0.45, 0.95, 0.7), (0.95, 0.55, 0.15, 1.0)]
+        "density", [(0.35, 0.55, 0.95, 0.25), (0.3, 0.4, 0.95, 0.8), (0.75, 0.25, 0.65, 0.9), (1.0, 0.6, 0.1, 1.0)]
     )
     values = np.log1p(density.T)
     axes.grid(visible=False)

@@ -37,12 +37,14 @@ body { margin: 0 auto; padding: 1.5rem 1rem 3rem; max-width: 72rem; background: 
 h1 { margin: 0 0 .25rem; font-size: 1.6rem; overflow-wrap: anywhere; }
 h2 { margin: 2rem 0 .75rem; font-size: 1.2rem; }
 h3 { margin: 0 0 .25rem; font-size: 1rem; }
-.facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(9.5rem, 1fr)); gap: .5rem; margin: 1rem 0 0; }
+.facts { display: grid; grid-template-columns: repeat(auto-fit, minmax(10.5rem, 1fr)); gap: .5rem; margin: 1rem 0 0; }
 .facts div { background: var(--card); border-radius: 8px; padding: .5rem .75rem; }
 .facts dt { color: var(--soft); font-size: .8rem; }
 .facts dd { margin: 0; font-weight: 600; overflow-wrap: anywhere; font-variant-numeric: tabular-nums; }
 .source, figcaption, footer { color: var(--soft); font-size: .85rem; overflow-wrap: anywhere; }
+.source { margin-top: .75rem; }
 .source p { margin: .2rem 0; }
+a { color: var(--main); }
 .advice { margin: 0; padding: 0; list-style: none; }
 .advice li { display: grid; grid-template-columns: 9.5rem 1fr; gap: .75rem; padding: .5rem 0;
   border-top: 1px solid var(--grid); }
@@ -58,7 +60,8 @@ th, td { padding: .4rem .6rem .4rem 0; border-top: 1px solid var(--grid); text-a
 th { color: var(--soft); font-weight: 600; }
 td { overflow-wrap: anywhere; }
 td.number { text-align: right; font-variant-numeric: tabular-nums; }
-.verdict { font-weight: 700; white-space: nowrap; }
+.verdict { font-weight: 700; }
+.verdict, .name { white-space: nowrap; }
 .ok { color: var(--ok); } .note { color: var(--note); } .warning { color: var(--warning); } .error { color: var(--error); }
 .remedy { color: var(--soft); }
 @media (max-width: 40rem) { .advice li { grid-template-columns: 1fr; gap: 0; } }
@@ -227,13 +230,14 @@ def _plots(plots: Iterable[Plot]) -> str:
 
 
 def _checks(checks: Iterable[Check]) -> str:
+    worst_first = sorted(checks, key=lambda check: -VERDICTS.index(check.verdict))
     rows = "\n".join(
-        f'<tr><td class="verdict {check.verdict}">{check.verdict}</td><td>{escape(check.name)}</td><td>{_details(check)}</td>'
-        f'<td class="number">{"" if check.count is None else f"{check.count:,}"}</td></tr>'
-        for check in checks
+        f'<tr><td class="verdict {check.verdict}">{check.verdict}</td><td class="name">{escape(check.name)}</td>'
+        f'<td>{_details(check)}</td><td class="number">{"" if check.count is None else f"{check.count:,}"}</td></tr>'
+        for check in worst_first
     )
     return (
-        '<h2 id="checks">All checks</h2>\n<div class="scroll"><table>\n'
+        '<h2 id="checks">All checks, the worst first</h2>\n<div class="scroll"><table>\n'
         f"<tr><th>verdict</th><th>check</th><th>what was found</th><th>number</th></tr>\n{rows}\n</table></div>"
     )
 

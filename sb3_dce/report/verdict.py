@@ -12,8 +12,8 @@ from sb3_dce.data.layout import row_blocks
 from sb3_dce.data.transitions import Transitions
 from sb3_dce.report.behaviour import Behaviour
 
-# Share of the reward per step that the hand-tuned penalties of the paper's rows amount to.
-REWARD_BUDGET = (0.3, 0.9)
+# Usual share of a penalty in the reward per step: from the lowest of the paper's hand-tuned rows to where room gets short.
+REWARD_BUDGET = (0.3, NARROW_MARGIN)
 # Discount of the sentence about the size of Q.
 GAMMA = 0.99
 # Values that float32 networks with learning rate 3e-4 reach in a normal run; the paper's gym sets give up to about 500.
@@ -84,12 +84,11 @@ def _beta(transitions: Transitions, penalty: Penalty) -> tuple[str, str]:
         low, high = (share * budget for share in REWARD_BUDGET)
         lowering = penalty.shift / (1.0 - GAMMA)
         return "beta", (
-            f"There are no true terminals, so no beta makes dying attractive. A penalty of 30 to 90 % of the mean absolute "
-            f"reward per step, {budget / factor:.3g}, is beta = {low:.2g} to {high:.2g}. {planned}, which lowers Q by up to "
-            f"{lowering:.3g} (gamma = {GAMMA:g})."
+            f"There are no true terminals, so no beta makes dying attractive. A penalty of {REWARD_BUDGET[0]:.0%} to "
+            f"{REWARD_BUDGET[1]:.0%} of the mean absolute reward per step, {budget / factor:.3g}, is beta = {low:.2g} to "
+            f"{high:.2g}. {planned}, which lowers Q by up to {lowering:.3g} (gamma = {GAMMA:g})."
         )
-    share = info.n_terminals / max(len(info.episode_lengths), 1)
-    ends = f"{min(share, 1.0):.0%} of the episodes end with a true terminal"
+    ends = f"{info.n_terminals:,} episodes end with a true terminal"
     if reward <= 0:
         return "beta", (
             f"{ends} and the mean reward per step is {reward:.3g}: living does not pay, so every beta above 0 makes the "
@@ -110,18 +109,17 @@ def _beta(transitions: Transitions, penalty: Penalty) -> tuple[str, str]:
 
 def _rewards(transitions: Transitions) -> tuple[str, str]:
     info = transitions.info
-    value = float(np.abs(transitions.rewards).mean(dtype=np.float64)) / (1.0 - GAMMA)
+    reward = float(np.abs(transitions.rewards).mean(dtype=np.float64))
+    value = reward / (1.0 - GAMMA)
+    values = f"a mean absolute reward of {reward:.3g} gives values of up to about {value:.3g} (gamma = {GAMMA:g})"
     if MIN_VALUE <= value <= MAX_VALUE:
-        text = f"Leave them as they are for DCE: the mean absolute reward means values of up to about {value:.3g}."
+        text = f"Leave them as they are for DCE: {values}."
     elif value == 0.0:
         text = "Every reward is 0: there is nothing to learn from but the actions."
     else:
         size = "very large" if value > MAX_VALUE else "very small"
         factor = 10.0 ** round(math.log10(100.0 / value))
-        text = (
-            f"The mean absolute reward means values of about {value:.3g}, {size}: use reward_scale = {factor:g}, and beta in "
-            "proportion."
-        )
+        text = f"Use reward_scale = {factor:g}, and beta in proportion: {values}, which is {size}."
     if info.return_range > 0:
         text += (
             f" IQL's scaling (reward_normalization='iql') multiplies them by {1000.0 / info.return_range:.3g}, because "
