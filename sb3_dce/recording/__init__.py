@@ -1,6 +1,6 @@
 """Making datasets: recording policies in their environments, and the recipes of the ``-sb3`` sets."""
 
 from sb3_dce.recording.episodes import RecordingSpec
-from sb3_dce.recording.record import Recorded, record
+from sb3_dce.recording.recorder import Recorded, record
 
 __all__ = ["Recorded", "RecordingSpec", "record"]

@@ -24,7 +24,7 @@ from sb3_dce.data.locate import search_folders
 from sb3_dce.data.transitions import Transitions
 from sb3_dce.errors import ConfigError, DatasetError, DatasetNotFoundError
 from sb3_dce.recording.episodes import Arrays, RecordingSpec
-from sb3_dce.recording.record import Recorded, check_target, describe, record, score_of
+from sb3_dce.recording.recorder import Recorded, check_target, describe, record, score_of
 
 POLICIES_VARIABLE = "SB3_DCE_POLICIES"
 

@@ -91,7 +91,8 @@ def record(
     :raises CheckpointError: if the policy cannot be read or the file cannot be written
     """
     started = time.monotonic()
-    if (n_rows is None) == (n_episodes is None) or min(n_rows or 1, n_episodes or 1, workers) < 1:
+    sizes = [size for size in (n_rows, n_episodes) if size is not None]
+    if len(sizes) != 1 or min(*sizes, workers) < 1:
         raise ConfigError(
             f"give either rows or episodes, each and the workers at least 1, got {n_rows}, {n_episodes} and {workers}",
             key="steps",
