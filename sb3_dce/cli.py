@@ -43,9 +43,7 @@ def demo(
 @app.command()
 def train(
     dataset: DatasetArgument,
-    algo: Annotated[
-        str, typer.Option(help="Agent: the name of a file in zoo_hyperparams: dce, offline_iql, ...")
-    ] = "dce",
+    algo: Annotated[str, typer.Option(help="Agent: the name of a file in zoo_hyperparams: dce, offline_iql, ...")] = "dce",
     updates: Annotated[
         float, typer.Option(min=0, show_default=False, help="Gradient steps, e.g. 1e6; default: the dataset's row.")
     ] = 0,
