@@ -17,6 +17,7 @@ from sb3_dce.data.catalog import DatasetSpec
 from sb3_dce.data.columns import ColumnSummary, copy_columns
 from sb3_dce.data.episodes import Episodes, d4rl_rows, fill_next_observations, find_episodes, usable_rows
 from sb3_dce.data.layout import WIDE_BLOCK_ROWS, ArraySource, RowLayout, check_layout, read_flags, row_blocks
+from sb3_dce.data.memory import require_memory
 from sb3_dce.data.quality import (
     Findings,
     check_actions,
@@ -29,8 +30,6 @@ from sb3_dce.data.quality import (
 )
 from sb3_dce.data.records import DatasetInfo, ReadOptions
 from sb3_dce.errors import DatasetSecurityError, DatasetSemanticsError
-
-MAX_SHARE_OF_FREE_MEMORY = 0.8
 
 
 class BuiltRows(NamedTuple):
@@ -155,28 +154,13 @@ def build_rows(
 
 
 def _allocate(n_rows: int, width: int, where: str) -> np.ndarray:
-    needed = 4 * n_rows * width
-    free = _free_memory()
-    if free is None or needed <= MAX_SHARE_OF_FREE_MEMORY * free:
-        try:
-            return np.empty((n_rows, width), dtype=np.float32)
-        except MemoryError:
-            pass
-    raise DatasetSecurityError(
-        f"{n_rows:,} rows need {needed:,} bytes of memory, {'too many' if free is None else f'{free:,}'} are free",
-        where=where,
-        hint="Use part of the data: memory-mapped arrays can be sliced and given to Transitions.from_arrays",
-        count=n_rows,
-    )
-
-
-def _free_memory() -> int | None:
-    """Bytes that can be had without swapping, None where the system does not say."""
+    hint = "Use part of the data: memory-mapped arrays can be sliced and given to Transitions.from_arrays"
+    require_memory(4 * n_rows * width, f"{n_rows:,} rows", where, hint)
     try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
-    except (OSError, StopIteration):
-        return None
+        return np.empty((n_rows, width), dtype=np.float32)
+    except MemoryError as exc:
+        what = f"{n_rows:,} rows of {4 * width} bytes do not fit into the memory of this machine"
+        raise DatasetSecurityError(what, where=where, hint=hint, count=n_rows) from exc
 
 
 def _require_rows(used: np.ndarray, where: str) -> None:

@@ -34,6 +34,8 @@ def read_head(path: Path) -> bytes:
         raise DatasetNotFoundError("no such file", where=str(path), hint="Check the path", path=path)
     if path.is_dir():
         raise DatasetFormatError("a folder, not a file", where=str(path), hint="Name one .hdf5 file in it", path=path)
+    if not path.is_file():  # a pipe would be waited for
+        raise DatasetFormatError("a pipe or a device, not a file", where=str(path), hint="Name a file", path=path)
     try:
         with open(path, "rb") as file:
             head = file.read(64)

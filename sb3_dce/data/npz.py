@@ -7,6 +7,7 @@ unpickled, and the size in the header has to agree with that of the archive befo
 
 from __future__ import annotations
 
+import io
 import tokenize
 import zipfile
 import zlib
@@ -25,10 +26,13 @@ from sb3_dce.data.file_checks import translated_errors
 from sb3_dce.data.hdf5 import DEFAULT_MAX_BYTES, MAX_OBJECTS, MAX_RATIO, RATIO_APPLIES_ABOVE
 from sb3_dce.data.layout import CORE_KEYS
 from sb3_dce.data.locate import require_file
+from sb3_dce.data.memory import require_memory
 from sb3_dce.errors import DatasetError, DatasetFormatError, DatasetIntegrityError, DatasetSecurityError
 from sb3_dce.files import write_atomically
 
 _READ_BYTES = 2**20
+_MAX_HEADER_BYTES = 10_000  # NumPy's own limit, which it looks at when it has read the header
+_MAX_DIRECTORY_BYTES = 4 * 2**20
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
@@ -47,6 +51,7 @@ def arrays_from_npz(path: str | PathLike[str], *, max_bytes: int = DEFAULT_MAX_B
     path = require_file(path)
     with translated_errors(path), open(path, "rb") as file:
         _check_signature(file, path)
+        _check_directory(file, path)
         with _zip_errors(path), zipfile.ZipFile(file) as archive:
             members = _select(archive.infolist(), path, max_bytes)
             return {key: _read_member(archive, member, key, path) for key, member in members.items()}
@@ -100,6 +105,16 @@ def _check_signature(file: BinaryIO, path: Path) -> None:
     raise DatasetIntegrityError(what, where=str(path), hint="Download or copy it again", path=path)
 
 
+def _check_directory(file: BinaryIO, path: Path) -> None:
+    """Refuse an archive with too many members, which ``zipfile`` would read all at once."""
+    with translated_errors(path):
+        end = zipfile._EndRecData(file)  # type: ignore[attr-defined]  # position 5 is the size of the directory
+    file.seek(0)
+    if end and end[5] > _MAX_DIRECTORY_BYTES:
+        what = f"more than {MAX_OBJECTS:,} members, or very long names: their list has {end[5]:,} bytes"
+        raise DatasetSecurityError(what, where=str(path), hint="Write the arrays again with numpy.savez", path=path)
+
+
 @contextmanager
 def _zip_errors(path: Path) -> Iterator[None]:
     """Errors of damaged archives that are not built-in ones."""
@@ -133,6 +148,7 @@ def _select(infos: Iterable[zipfile.ZipInfo], path: Path, max_bytes: int) -> dic
             hint=f"If the file is honest, pass max_bytes={total}",
             path=path,
         )
+    require_memory(total, "the arrays", str(path), "Use part of the data")
     for key, info in members.items():
         if info.file_size > RATIO_APPLIES_ABOVE and info.file_size > MAX_RATIO * info.compress_size:
             what = f"declares {info.file_size:,} bytes but stores {info.compress_size:,}; data do not compress so well"
@@ -170,8 +186,11 @@ def _read_header(stream: Any, key: str, path: Path) -> _Header:
     """Header of an array of numbers; the stream then stands at its first byte."""
     try:
         version = npy.read_magic(stream)
-        read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-        header = _Header(*read(stream))
+        size = stream.read(2 if version == (1, 0) else 4)
+        if int.from_bytes(size, "little") > _MAX_HEADER_BYTES:
+            raise ValueError("too long")
+        text = io.BytesIO(size + stream.read(int.from_bytes(size, "little")))
+        header = _Header(*(npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0)(text))
     except (ValueError, TypeError, SyntaxError, tokenize.TokenError, MemoryError, RecursionError) as exc:
         what = "its header is not that of a NumPy array"
         raise _error(DatasetSecurityError, what, path, key, "Write the arrays again with numpy.savez") from exc

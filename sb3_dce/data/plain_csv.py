@@ -90,7 +90,7 @@ def _count_rows(file: BinaryIO, sep: str, n_columns: int) -> int | None:
 def _blocks(file: BinaryIO) -> Iterator[bytes]:
     """Whole lines, each with its end."""
     while block := file.read(_BLOCK_BYTES):
-        block += file.readline()
+        block += file.readline(_BLOCK_BYTES)  # a line that is longer is not plain
         yield block if block.endswith(b"\n") else block + b"\n"
 
 

@@ -12,10 +12,11 @@ import os
 from array import array
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import count
 from operator import itemgetter
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from sb3_dce.data.file_checks import translated_errors
 from sb3_dce.data.hdf5 import DEFAULT_MAX_BYTES
 from sb3_dce.data.layout import CORE_KEYS, MATRIX_KEYS, REQUIRED_KEYS
 from sb3_dce.data.locate import require_file
+from sb3_dce.data.memory import require_memory
 from sb3_dce.data.plain_csv import numbers_of, read_plain, without_word
 from sb3_dce.errors import (
     ConfigError,
@@ -50,6 +52,7 @@ AMBIGUOUS_NAMES = ("done", "dones")
 _WANTED = "Columns are called obs_0, obs_1, ..., action_0, ..., reward, terminal, and optionally timeout and next_obs_0, ..."
 _KEY_OF_NAME = {name: key for key, names in NAMES.items() for name in names}
 _BYTES_PER_CELL = 8
+_MAX_LINE = 2**24
 
 
 def arrays_from_dataframe(frame: pd.DataFrame, columns: Columns | None = None) -> dict[str, np.ndarray]:
@@ -86,7 +89,10 @@ def arrays_from_csv(
     _check_size(os.path.getsize(path), max_bytes, path)
     try:
         with translated_errors(path), open(path, encoding="utf-8-sig", newline="") as file:
-            return _read_csv(_Records(csv.reader(file, delimiter=sep, skipinitialspace=True, strict=True)), columns, path, sep)
+            lines = _lines(file, path)
+            return _read_csv(
+                _Records(csv.reader(lines, delimiter=sep, skipinitialspace=True, strict=True)), columns, path, sep
+            )
     except DatasetIntegrityError as exc:
         if not isinstance(exc.__cause__, UnicodeDecodeError):
             raise
@@ -115,7 +121,9 @@ def arrays_from_parquet(
         names = file.schema_arrow.names
         found = _find_columns(names, columns, str(path))
         used = [names[i] for positions in found.values() for i in positions]
-        _check_size(file.metadata.num_rows * len(used) * _BYTES_PER_CELL, max_bytes, path)
+        n_bytes = file.metadata.num_rows * len(used) * _BYTES_PER_CELL
+        _check_size(n_bytes, max_bytes, path)
+        require_memory(n_bytes, "the columns", str(path), "Use part of the data")
         frame = file.read(columns=used).to_pandas(ignore_metadata=True)
     return _from_frame(frame, columns, str(path))
 
@@ -259,6 +267,17 @@ class _Line(NamedTuple):
     def fault(self, what: str, hint: str, name: str | None = None) -> DatasetFormatError:
         where = f"{self.path}, line {self.number}" + (f", column {name!r}" if name is not None else "")
         return DatasetFormatError(what, where=where, hint=hint, path=self.path, key=name, index=self.number)
+
+
+def _lines(file: TextIO, path: Path) -> Iterator[str]:
+    """Lines of a file; one that does not end would fill the memory."""
+    for number in count(1):
+        line = file.readline(_MAX_LINE)
+        if len(line) == _MAX_LINE and not line.endswith("\n"):
+            raise _Line(path, number).fault(f"longer than {_MAX_LINE - 1:,} characters", "Write one line per step")
+        if not line:
+            return
+        yield line
 
 
 class _Records:
