@@ -21,7 +21,7 @@ import h5py
 import numpy as np
 
 from sb3_dce.data.file_checks import not_hdf5, read_head, translated_errors
-from sb3_dce.data.layout import BLOCK_ROWS
+from sb3_dce.data.layout import BLOCK_ROWS, ArraySource
 from sb3_dce.errors import DatasetFormatError, DatasetIntegrityError, DatasetSecurityError
 from sb3_dce.files import write_atomically
 
@@ -59,6 +59,31 @@ class HDF5Array:
         """
         with translated_errors(self._path, self._key):
             block: np.ndarray = self._dataset[rows]
+        return block
+
+
+class EpisodeArray:
+    """
+    One array of very many: it is opened anew for each reading, since HDF5 keeps 30 kB in memory for one that is open.
+
+    :param file: the open file
+    :param key: path of an array that has passed the checks of :class:`EpisodeFile`
+    :param dataset: this array
+    :param path: file, for messages
+    """
+
+    def __init__(self, file: h5py.File, key: str, dataset: h5py.Dataset, path: Path) -> None:
+        self._file, self._key, self._path = file, key, path
+        self.shape: tuple[int, ...] = dataset.shape or ()
+        self.dtype: np.dtype = dataset.dtype
+
+    def __getitem__(self, rows: slice) -> np.ndarray:
+        """
+        :param rows: rows to read
+        :return: shape (len(rows), ...), in the type of the file
+        """
+        with translated_errors(self._path, self._key):
+            block: np.ndarray = self._file[self._key][rows]
         return block
 
 
@@ -122,7 +147,7 @@ class D4RLFile:
             attrs = self._file.attrs
             return {name: attrs[name] for name in attrs if attrs.get_id(name).shape == ()}
 
-    def select(self, names: Iterable[str]) -> dict[str, HDF5Array]:
+    def select(self, names: Iterable[str]) -> dict[str, ArraySource]:
         """
         Those of the named arrays that are in the file, checked but not read.
 
@@ -132,9 +157,18 @@ class D4RLFile:
         :raises DatasetSecurityError: if an array lies in another file, needs a filter that is not built in, or is too large
         """
         with translated_errors(self.path):
-            found = {name: self._find(name) for name in names}
-            chosen = {name: item for name, item in found.items() if item is not None}
-            groups = [name for name, item in chosen.items() if not isinstance(item, h5py.Dataset)]
+            arrays: dict[str, ArraySource] = {}
+            sizes: dict[str, tuple[int, int]] = {}
+            groups: list[str] = []
+            for name in names:
+                item = self._find(name)
+                if not isinstance(item, h5py.Dataset):
+                    groups += [] if item is None else [name]
+                    continue
+                _check_storage(item, name, self.path)
+                if item.shape:
+                    sizes[name] = _declared_bytes(item), item.id.get_storage_size()
+                arrays[name] = self._array(name, item)
             if groups:
                 raise DatasetFormatError(
                     f"{', '.join(groups)} should be an array but is a group or a type",
@@ -143,10 +177,8 @@ class D4RLFile:
                     path=self.path,
                     key=groups[0],
                 )
-            for name, dataset in chosen.items():
-                _check_storage(dataset, name, self.path)
-            self._check_size(chosen)
-        return {name: HDF5Array(dataset, self.path) for name, dataset in chosen.items()}
+            self._check_size(sizes)
+        return arrays
 
     def _checked_names(self) -> Iterator[str]:
         """Names in the file, after checking that each link on the way to them is a hard one."""
@@ -155,10 +187,12 @@ class D4RLFile:
     def _find(self, name: str) -> Any:
         return self._file[name] if name in self._file else None
 
-    def _check_size(self, chosen: Mapping[str, h5py.Dataset]) -> None:
-        declared = {name: _declared_bytes(dataset) for name, dataset in chosen.items() if dataset.shape}
-        stored = {name: chosen[name].id.get_storage_size() for name in declared}
-        total, total_stored = sum(declared.values()), sum(stored.values())
+    def _array(self, name: str, dataset: h5py.Dataset) -> ArraySource:
+        return HDF5Array(dataset, self.path)
+
+    def _check_size(self, sizes: Mapping[str, tuple[int, int]]) -> None:
+        """Sizes are those declared and those stored, bytes."""
+        total, total_stored = (sum(size[which] for size in sizes.values()) for which in (0, 1))
         if total > self.max_bytes:
             raise DatasetSecurityError(
                 f"the arrays declare {total:,} bytes ({total_stored:,} stored, ratio {total / max(total_stored, 1):.0f}), "
@@ -167,12 +201,12 @@ class D4RLFile:
                 hint=f"If the file is honest, pass max_bytes={total}, or take part of it: memory-mapped arrays can be sliced "
                 "and given to Transitions.from_arrays",
                 path=self.path,
-                key=max(declared, key=lambda name: declared[name]),
+                key=max(sizes, key=lambda name: sizes[name][0]),
             )
-        for name, size in declared.items():
-            if size > RATIO_APPLIES_ABOVE and size > MAX_RATIO * stored[name]:
+        for name, (size, stored) in sizes.items():
+            if size > RATIO_APPLIES_ABOVE and size > MAX_RATIO * stored:
                 raise DatasetSecurityError(
-                    f"declares {size:,} bytes but stores {stored[name]:,}, ratio {size / max(stored[name], 1):.0f}; "
+                    f"declares {size:,} bytes but stores {stored:,}, ratio {size / max(stored, 1):.0f}; "
                     f"data of this size do not compress beyond {MAX_RATIO}",
                     where=f"{self.path}, key {name}",
                     hint="Rewrite the file without compression if it is honest",
@@ -191,19 +225,26 @@ class EpisodeFile(D4RLFile):
 
     _layout_hint = "metadata.json of the dataset says that it is an array"
 
+    _group: tuple[str | None, Any] = (None, None)
+
     def _checked_names(self) -> Iterator[str]:
         for name in self._file:
             _check_link(self._file.get(name, getlink=True), name, self.path)
             yield name
 
     def _find(self, name: str) -> Any:
-        item = self._file
-        for part in name.split("/"):
-            if not isinstance(item, h5py.Group) or not item.id.links.exists(part.encode()):
-                return None
-            _check_link(item.get(part, getlink=True), name, self.path)
-            item = item[part]
-        return item
+        """An item by its path; the way to its group is followed once for all that are asked for one after the other."""
+        way, _, last = name.rpartition("/")
+        if way != self._group[0]:
+            self._group = way, self._find(way) if way else self._file
+        group = self._group[1]
+        if not isinstance(group, h5py.Group) or not group.id.links.exists(last.encode()):
+            return None
+        _check_link(group.get(last, getlink=True), name, self.path)
+        return group[last]
+
+    def _array(self, name: str, dataset: h5py.Dataset) -> ArraySource:
+        return EpisodeArray(self._file, name, dataset, self.path)
 
 
 def write_hdf5(
@@ -279,13 +320,13 @@ def _check_link(link: Any, key: str, path: Path) -> None:
 
 def _check_storage(dataset: h5py.Dataset, name: str, path: Path) -> None:
     """Refuse arrays whose bytes lie in other files or need a filter that is not built in."""
-    external = dataset.external
-    filters = dataset.id.get_create_plist()
-    codes = [filters.get_filter(i)[0] for i in range(filters.get_nfilters())]
+    plan = dataset.id.get_create_plist()  # asked once: h5py's own properties make it anew each time
+    external = dataset.external if plan.get_external_count() else None
+    codes = [plan.get_filter(i)[0] for i in range(plan.get_nfilters())]
     unknown = [code for code in codes if code not in ALLOWED_FILTERS]
     if external:
         what, hint = f"its numbers lie in another file, {external[0][0]!r}", "Copy the data into the file itself"
-    elif dataset.is_virtual:
+    elif plan.get_layout() == h5py.h5d.VIRTUAL:
         what, hint = "a virtual dataset, its numbers lie in other files", "Copy the data into the file itself"
     elif unknown:
         allowed = ", ".join(ALLOWED_FILTERS.values())
