@@ -130,7 +130,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         self.execution = execution
         self.precision = precision
         self.dataset_statistics = None
-        self._engine: Engine | None = None
+        self._engine: Engine[TrainState] | None = None
         self._generator: th.Generator | None = None
         self._coef: dict[str, th.Tensor] = {}
         self._coef_values: dict[str, float] = {}  # what the tensors hold
@@ -144,6 +144,8 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
     # Networks of the policy by attribute name. Each becomes an attribute of the agent and a storage of the update; those
     # with an ``optimizer`` are trained, the others are targets or frozen.
     networks: ClassVar[tuple[str, ...]]
+    # Parameters of the subclass in which the members of a population may differ, since they reach the update as numbers.
+    population_scalars: ClassVar[frozenset[str]] = frozenset()
 
     def make_update(self, storages: dict[str, Storage]) -> Update:
         """
@@ -185,6 +187,13 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
             "reward_scale": self._reward_factor(),
             "reward_shift": self.reward_shift,
         }
+
+    def coefficients_hold_until(self, n_updates: int) -> int:
+        """
+        :param n_updates: completed updates
+        :return: completed updates before which :meth:`coefficients` gives the same numbers again
+        """
+        return n_updates + 1
 
     def policy_settings(self) -> dict[str, Any]:
         """
@@ -319,7 +328,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
                 engine.step(batch, noise, self._coefficient_tensors(dtype), **self.update_variant(self._n_updates))
                 self._n_updates += 1
 
-    def _bound_engine(self, planned_updates: int) -> Engine:
+    def _bound_engine(self, planned_updates: int) -> Engine[TrainState]:
         """
         The engine, made anew when the modules' tensors were replaced (loading, ``set_parameters``, ``to``), or when a long
         run begins that is worth compiling. What is compiled stays so: the price is paid.

@@ -209,19 +209,29 @@ class OfflineReplayBuffer(ReplayBuffer):
         :return: tensors of shape (batch, ...); ``dones`` is 1 only at true terminals
         """
         assert self.rows is not None, "the buffer is empty"
-        obs, action, reward, done, next_obs = self._columns(self.rows.index_select(0, indices))
-        shape = (len(indices), *self.obs_shape)
-        obs, next_obs = obs.reshape(shape), next_obs.reshape(shape)
-        if env is not None:
-            obs, next_obs = (self._through_numpy(env.normalize_obs, o) for o in (obs, next_obs))
-            reward = self._through_numpy(env.normalize_reward, reward)
-        return ReplayBufferSamples(obs, action, next_obs, done, reward)
+        batch = self.split_rows(self.rows.index_select(0, indices))
+        if env is None:
+            return batch
+        return batch._replace(
+            observations=self._through_numpy(env.normalize_obs, batch.observations),
+            next_observations=self._through_numpy(env.normalize_obs, batch.next_observations),
+            rewards=self._through_numpy(env.normalize_reward, batch.rewards),
+        )
+
+    def split_rows(self, rows: th.Tensor) -> ReplayBufferSamples:
+        """
+        :param rows: some rows of this layout, shape (..., batch, width)
+        :return: their columns, each of shape (..., batch, ...)
+        """
+        obs, action, reward, done, next_obs = self._columns(rows)
+        shape = (*rows.shape[:-1], *self.obs_shape)
+        return ReplayBufferSamples(obs.reshape(shape), action, next_obs.reshape(shape), done, reward)
 
     def _through_numpy(self, function: Any, tensor: th.Tensor) -> th.Tensor:
         return th.as_tensor(function(tensor.cpu().numpy()), dtype=th.float32, device=self._device)
 
     def _columns(self, rows: th.Tensor) -> tuple[th.Tensor, ...]:
-        return rows.split([self.obs_dim, self.action_dim, 1, 1, self.obs_dim], dim=1)
+        return rows.split([self.obs_dim, self.action_dim, 1, 1, self.obs_dim], dim=-1)
 
     def _view(self, column: int, *shape: int) -> np.ndarray:
         if self.rows is None:

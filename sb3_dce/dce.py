@@ -97,6 +97,12 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
 
     algo_name: ClassVar[str] = "dce"
     networks = ("actor", "critic", "critic_target", "value_net", "value_net_target")
+    population_scalars = frozenset(
+        {
+            *("expectile", "ent_coef", "target_entropy", "td_loss_coef"),
+            *("beta", "beta_final", "beta_rate", "beta_update_every", "steps_per_epoch"),
+        }
+    )
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": OfflineSACPolicy}
     policy: OfflineSACPolicy
     critic: OfflineCritic
@@ -330,6 +336,12 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
             "beta": beta,
             "beta_eff": beta_eff(beta, self.td_loss_coef),
         }
+
+    def coefficients_hold_until(self, n_updates: int) -> int:
+        if callable(self.learning_rate):
+            return n_updates + 1
+        every = self.beta_update_every * self.steps_per_epoch
+        return (n_updates // every + 1) * every
 
     def derived_metrics(self, means: dict[str, float]) -> dict[str, float]:
         extra = {

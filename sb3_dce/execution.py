@@ -11,13 +11,12 @@ from __future__ import annotations
 import shutil
 import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import torch as th
 from torch.utils._pytree import tree_leaves, tree_map
 
 from sb3_dce.errors import DivergenceError, SB3DCEWarning
-from sb3_dce.state import TrainState
 
 # (state tree, batch, noise, coefficients) -> (new state tree, metrics), see the ``update`` of an algorithm.
 Update = Callable[..., tuple[dict[str, Any], dict[str, th.Tensor]]]
@@ -60,6 +59,18 @@ def choose_execution(execution: str, planned_updates: int, device: th.device) ->
 
 def _has_compiler() -> bool:
     return any(shutil.which(name) for name in ("g++", "clang++", "c++", "cl"))
+
+
+class State(Protocol):
+    """What an engine needs of a state: its tensors, which stay where they are."""
+
+    def read(self) -> dict[str, Any]:
+        """
+        :return: name -> learner or flat vector
+        """
+
+
+S = TypeVar("S", bound=State)
 
 
 class MetricSums:
@@ -141,16 +152,16 @@ def refuse_divergence(means: dict[str, float], first: int, last: int) -> None:
         )
 
 
-class Engine:
+class Engine(Generic[S]):
     """
     Runs updates on one state, that of a model or of a whole population.
 
     :param update: pure update, ``update(state, batch, noise, coef, **variant)``
-    :param state: storage of the model
+    :param state: where the tensors of the model or the population lie
     :param execution: "eager", "compile" or "cudagraph"
     """
 
-    def __init__(self, update: Update, state: TrainState, execution: str) -> None:
+    def __init__(self, update: Update, state: S, execution: str) -> None:
         self.state = state
         self.execution = execution
         self.metrics = MetricSums()
