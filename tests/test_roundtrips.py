@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from unittest.mock import patch
 
 import numpy as np
@@ -17,9 +17,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from sb3_dce.data import D4RLFile, Transitions, load_transitions, resolve, write_hdf5
+from sb3_dce.data.layout import CORE_KEYS, MATRIX_KEYS
+from sb3_dce.data.npz import arrays_from_npz, write_npz
 from sb3_dce.data.plain_csv import read_plain
-from sb3_dce.data.tables import arrays_from_csv
-from sb3_dce.errors import DatasetError
+from sb3_dce.data.tables import arrays_from_csv, arrays_from_parquet
+from sb3_dce.errors import DatasetError, DatasetSemanticsError
 
 pytestmark = pytest.mark.filterwarnings("ignore::sb3_dce.errors.DatasetWarning")
 Arrays = dict[str, np.ndarray]
@@ -150,3 +153,273 @@ def test_lines_longer_than_python_allows_are_left_to_it(tmp_path: Path) -> None:
     for length, plain in ((csv.field_size_limit() - 10, True), (csv.field_size_limit() + 10, False)):
         path.write_text("a,b\n" + "1,2\n" * 3 + "1," + "x" * length + "\n1,2\n")
         assert (read_plain(path, ",", 1, 2, [0], []) is not None) == plain
+
+
+# -- what is written comes back ------------------------------------------------------------------------------------
+
+floats = st.floats(width=32, allow_nan=False, allow_infinity=False, allow_subnormal=True)
+
+
+@st.composite
+def datasets(draw: st.DrawFn, any_order: bool = False) -> Arrays:
+    """
+    Any small dataset: widths, flags, optional keys; next observations that mostly fit, so that there are unmarked jumps.
+
+    :param any_order: also next observations without any relation to the next row
+    """
+    n, obs_dim, act_dim = draw(st.integers(2, 24)), draw(st.integers(1, 4)), draw(st.integers(1, 3))
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    special = draw(st.lists(floats, max_size=6))
+    observations = rng.standard_normal((n + 1, obs_dim)).astype(np.float32)
+    rewards = rng.standard_normal(n).astype(np.float32)
+    for value in special:  # zeros with a sign, denormal and huge numbers
+        observations[rng.integers(n), rng.integers(obs_dim)] = value
+        rewards[rng.integers(n)] = value
+    arrays: Arrays = {
+        "observations": observations[:-1],
+        "actions": rng.uniform(-1, 1, (n, act_dim)).astype(np.float32),
+        "rewards": rewards,
+        "terminals": rng.random(n) < draw(st.sampled_from([0, 0.1, 0.5, 1])),
+    }
+    if draw(st.booleans()):
+        arrays["timeouts"] = rng.random(n) < draw(st.sampled_from([0, 0.1, 0.5]))
+    if draw(st.booleans()):
+        following = observations[1:].copy()
+        ends = arrays["terminals"] | arrays.get("timeouts", np.zeros(n, dtype=bool))
+        following[ends] = rng.standard_normal((int(ends.sum()), obs_dim))
+        if any_order and draw(st.booleans()):
+            jumps = rng.random(n) < draw(st.sampled_from([0.03, 0.3]))
+            following[jumps] += 1
+        arrays["next_observations"] = following
+    return arrays
+
+
+def write_table(path: Path, arrays: Arrays) -> None:
+    columns = {}
+    for key, array in arrays.items():
+        columns |= {f"{key}_{i}": array[:, i] for i in range(array.shape[1])} if key in MATRIX_KEYS else {key: array}
+    frame = pd.DataFrame(columns)
+    if path.suffix == ".csv":
+        frame.to_csv(path, index=False)
+    else:
+        frame.to_parquet(path)
+
+
+def read_hdf5(path: Path) -> Arrays:
+    with D4RLFile(path) as file:
+        return {key: array[slice(None)] for key, array in file.select(CORE_KEYS).items()}
+
+
+FORMATS: dict[str, tuple[Callable[[Path, Arrays], object], Callable[[Path], Arrays]]] = {
+    ".hdf5": (write_hdf5, read_hdf5),
+    ".npz": (write_npz, arrays_from_npz),
+    ".parquet": (write_table, arrays_from_parquet),
+    ".csv": (write_table, arrays_from_csv),
+}
+
+
+@some_or_many
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_arrays_come_back_bit_for_bit(suffix: str, amount: settings, tmp_path: Path) -> None:
+    if suffix == ".parquet":
+        pytest.importorskip("pyarrow")
+    write, read = FORMATS[suffix]
+
+    @amount
+    @given(datasets())
+    def check(arrays: Arrays) -> None:
+        write(tmp_path / f"mine{suffix}", arrays)
+        got = read(tmp_path / f"mine{suffix}")
+        assert got.keys() == arrays.keys()
+        for key, array in arrays.items():
+            # A text has no types; its numbers are those of the shortest text that gives them again.
+            values = got[key].astype(array.dtype) if suffix == ".csv" else got[key]
+            assert values.dtype == array.dtype and values.shape == array.shape and values.tobytes() == array.tobytes(), key
+
+    check()
+
+
+@some_or_many
+@pytest.mark.parametrize("suffix", [".hdf5", ".npz"])
+def test_transitions_come_back_bit_for_bit(suffix: str, amount: settings, tmp_path: Path) -> None:
+    path = tmp_path / f"mine{suffix}"
+
+    @amount
+    @given(datasets(any_order=True))
+    def check(arrays: Arrays) -> None:
+        try:
+            first = Transitions.from_arrays(**arrays)
+            (first.to_npz if suffix == ".npz" else first.to_hdf5)(path)
+            second = load_transitions(path)
+        except DatasetSemanticsError:  # no usable row, or a single one
+            return
+        assert second.rows.tobytes() == first.rows.tobytes() and second.timeouts.tobytes() == first.timeouts.tobytes()
+
+    check()
+
+
+# -- rules of episodes, restated as a loop over the rows -----------------------------------------------------------
+
+
+class Reference(NamedTuple):
+    """What the rules give, a list entry for each transition."""
+
+    rows: list[int]
+    following: list[np.ndarray]
+    dones: list[bool]
+    timeouts: list[bool]
+    episodes: list[int]
+    returns: list[float]
+    lengths: list[int]
+    open_last: bool
+
+
+def loop_over_rows(arrays: Arrays, horizon: int | None, splits_by_steps: bool = True) -> Reference:
+    """
+    The rules one row at a time: a terminal ends an episode and wins over a timeout; without timeouts the time limit ends one,
+    or, if none is known, a jump of the observation; jumps of few rows end one in any case where timeouts are marked.
+    """
+    n = len(arrays["rewards"])
+    timeouts, following = arrays.get("timeouts"), arrays.get("next_observations")
+    jumps = [False] * n
+    n_inner = 0
+    for i in range(n - 1):
+        marked = arrays["terminals"][i] or (timeouts is not None and timeouts[i])
+        n_inner += not marked
+        if following is not None and not marked:
+            distance = np.linalg.norm(following[i].astype(np.float64) - arrays["observations"][i + 1])
+            jumps[i] = bool(distance > 1e-6)
+    if timeouts is not None and sum(jumps) >= 0.05 * max(n_inner, 1):
+        jumps = [False] * n  # so many that the rows are no sequence: only the flags count
+    if timeouts is None and horizon is not None and splits_by_steps:
+        jumps = [False] * n
+    result = Reference([], [], [], [], [], [], [], False)
+    step, total, episode = 0, 0.0, 0
+    for i in range(n):
+        step, total = step + 1, total + float(arrays["rewards"][i])
+        terminal = bool(arrays["terminals"][i])
+        if timeouts is not None:
+            limit = bool(timeouts[i]) or jumps[i]
+        elif horizon is not None and splits_by_steps:
+            limit = step == horizon
+        else:
+            limit = jumps[i]
+        ends = terminal or limit
+        if following is not None:
+            next_observation = following[i]
+        elif terminal:
+            next_observation = arrays["observations"][i]
+        elif ends or i == n - 1:
+            next_observation = None
+        else:
+            next_observation = arrays["observations"][i + 1]
+        if next_observation is not None:
+            for values, value in zip(result, (i, next_observation, terminal, ends and not terminal, episode), strict=False):
+                values.append(value)  # type: ignore[union-attr]
+        if ends:
+            result.returns.append(total)
+            result.lengths.append(step)
+            step, total, episode = 0, 0.0, episode + 1
+    return result._replace(open_last=step > 0)
+
+
+@some_or_many
+def test_episode_rules_equal_a_loop_over_the_rows(amount: settings) -> None:
+    @amount
+    @given(datasets(any_order=True), st.sampled_from([None, 1, 2, 3, 7]))
+    def check(arrays: Arrays, horizon: int | None) -> None:
+        expected = loop_over_rows(arrays, horizon)
+        try:
+            got = Transitions.from_arrays(**arrays, max_episode_steps=horizon)
+        except DatasetSemanticsError as error:
+            # Nothing is left, or the next observations are those of other rows.
+            assert not expected.rows or "a shift of" in str(error)
+            return
+        assert got.observations.tobytes() == arrays["observations"][expected.rows].tobytes()
+        assert got.actions.tobytes() == arrays["actions"][expected.rows].tobytes()
+        assert got.rewards.tobytes() == arrays["rewards"][expected.rows].tobytes()
+        assert got.next_observations.tobytes() == np.stack(expected.following).tobytes()
+        assert got.terminals.tolist() == expected.dones and got.timeouts.tolist() == expected.timeouts
+        assert got.episodes.tolist() == expected.episodes
+        assert got.info.episode_lengths.tolist() == expected.lengths and got.info.open_last_episode == expected.open_last
+        np.testing.assert_allclose(got.info.episode_returns, expected.returns, rtol=1e-12, atol=1e-6)
+        assert got.info.n_terminals == arrays["terminals"].sum()
+        assert got.info.dropped_rows == len(arrays["rewards"]) - len(expected.rows)
+
+    check()
+
+
+# -- D4RL's own rule, restated from its description ---------------------------------------------------------------
+
+
+def literal_d4rl(arrays: Arrays, limit: int) -> tuple[list[int], list[bool]]:
+    """
+    Rows and done flags of ``qlearning_dataset``: the last row is never used; a row with a timeout is left out, and without
+    timeouts one at which the step counter stands at ``limit - 1``. The counter is 0 after such a row, and 1 after a terminal,
+    since it is reset before that row is appended and counted up after it. The next observation is that of the next row.
+    """
+    rows, dones, counter = [], [], 0
+    for row in range(len(arrays["rewards"]) - 1):
+        final = bool(arrays["timeouts"][row]) if "timeouts" in arrays else counter == limit - 1
+        if final:
+            counter = 0
+            continue
+        done = bool(arrays["terminals"][row])
+        rows.append(row)
+        dones.append(done)
+        counter = 1 if done else counter + 1
+    return rows, dones
+
+
+@st.composite
+def layouts(draw: st.DrawFn) -> tuple[str, Arrays]:
+    """Id and arrays in one of the three layouts of D4RL, with episodes of any length."""
+    name = draw(st.sampled_from(["hopper-medium-v2", "door-human-v0", "kitchen-mixed-v0"]))
+    spec = resolve(name)
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    around = spec.max_episode_steps
+    usual = [1, 2, 5, 40, around - 1, around, around + 1, 2 * around + 3]
+    lengths = draw(st.lists(st.sampled_from(usual), min_size=1, max_size=6))
+    n, ends = sum(lengths), np.cumsum(lengths) - 1
+    kind = np.float32 if draw(st.booleans()) else np.float64  # older files have doubles
+    observations = rng.standard_normal((n + 1, spec.obs_dim)).astype(np.float32)
+    arrays: Arrays = {
+        "observations": observations[:-1].astype(kind),
+        "actions": rng.uniform(-1, 1, (n, spec.act_dim)).astype(np.float32).astype(kind),
+        "rewards": rng.integers(0, 5, n).astype(np.float32).astype(kind),
+    }
+    flags = np.zeros(n, dtype=bool)
+    flags[ends if draw(st.booleans()) else ends[:-1]] = True  # a file may end within an episode
+    if spec.family == "kitchen":
+        return name, arrays | {"terminals": flags.astype(np.float32)}
+    falls = (rng.random(n) < 0.5) & flags if spec.family == "gym" else np.zeros(n, dtype=bool)
+    arrays |= {"terminals": falls, "timeouts": flags & ~falls}
+    if spec.family == "gym":
+        following = observations[1:].copy()
+        following[flags] += 1
+        arrays["next_observations"] = following.astype(kind)
+    return name, arrays
+
+
+@some_or_many
+def test_d4rl_compat_equals_the_literal_rule_in_every_layout(amount: settings) -> None:
+    seen = set()
+
+    @amount
+    @given(layouts())
+    def check(layout: tuple[str, Arrays]) -> None:
+        name, arrays = layout
+        spec = resolve(name)
+        rows, dones = literal_d4rl(arrays, spec.max_episode_steps)
+        if not rows:
+            return
+        got = Transitions.from_arrays(**arrays, spec=spec, d4rl_compat=True)
+        assert got.observations.tobytes() == arrays["observations"][rows].astype(np.float32).tobytes()
+        following = arrays["observations"][np.array(rows) + 1].astype(np.float32)
+        assert got.next_observations.tobytes() == following.tobytes()
+        assert np.array_equal(got.actions, arrays["actions"][rows]) and np.array_equal(got.rewards, arrays["rewards"][rows])
+        assert got.terminals.tolist() == dones
+        seen.add(spec.family)
+
+    check()
+    assert seen == {"gym", "adroit", "kitchen"}
