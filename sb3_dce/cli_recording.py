@@ -191,7 +191,12 @@ def _progress() -> Iterator[Callable[[str, int, int], None]]:
                 tasks[label] = bar.add_task(label, total=total)
             bar.update(tasks[label], completed=done, total=total)
 
-        yield show
+        try:
+            yield show
+        except KeyboardInterrupt:
+            bar.stop()
+            Console(stderr=True).print("Interrupted. What there is has been kept; the same command goes on from there.")
+            raise
 
 
 def _print(made: Recorded) -> None:

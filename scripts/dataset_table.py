@@ -116,9 +116,9 @@ def page(folder: Path, machine: str) -> str:
         "# Generated datasets",
         "",
         "Made with `sb3-dce datasets generate <id> --policies <folder>` (`--rows 100000` for the Adroit expert sets), one "
-        "process, seed 0, by `python scripts/dataset_table.py`. They stand in for D4RL's sets and are not these: scores reached "
-        "with them cannot be compared with published ones. Scores have D4RL's constants; returns are those of the v4 locomotion "
-        "environments, and of Adroit with the corrections of this package.",
+        "process, seed 0, by `python scripts/dataset_table.py`. They stand in for D4RL's sets and are not these: scores "
+        "reached with them cannot be compared with published ones. Scores have D4RL's constants; returns are those of the "
+        "v4 locomotion environments, and of Adroit with the corrections of this package.",
         "",
         f"{first['versions']}; {machine}.",
         "",

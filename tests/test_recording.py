@@ -348,6 +348,22 @@ def test_command_records_into_the_folder_of_datasets(policy: Path, tmp_path: Pat
     assert sb3_dce(*command)[0] == 0 and (tmp_path / "hopper-v4-hopper-sb3.hdf5").is_file()
 
 
+def test_command_interrupted_while_it_writes_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    command = ("datasets", "record", "--policy", "random", "--env", "Hopper-v4", "--steps", "200", "--workers", "1")
+    command += ("--out", str(tmp_path / "x.hdf5"))
+
+    def interrupted(*args: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sb3_dce.recording.recorder.write_hdf5", interrupted)
+        code, _, stderr = sb3_dce(*command)
+    assert code == 130 and "the same command goes on" in stderr
+    monkeypatch.setattr(EpisodeRunner, "run", interrupted)  # nothing is left to be recorded
+    assert sb3_dce(*command)[0] == 0
+    assert len(read(tmp_path / "x.hdf5")["rewards"]) == 200
+
+
 @pytest.mark.parametrize("command", ["record", "generate"])
 def test_help_warns_of_code_in_zip_files(command: str) -> None:
     result = CliRunner().invoke(cli.app, ["datasets", command, "--help"], env={"COLUMNS": "200"})

@@ -120,13 +120,13 @@ def record(
                     progress(done(), total)
                 arrays, lengths = next(chunks)
                 parts.add(arrays, len(lengths))
+        progress(total, total)
+        arrays = parts.rows(n_rows) if n_rows is not None else parts.first_episodes(total)
+        attrs = {**describe(name, spec.env, arrays), **_origin(spec, runner), **(extra or {})}
+        write_hdf5(out, arrays, attrs)
     except BaseException:
         parts.flush()  # nothing is lost by Ctrl-C
         raise
-    progress(total, total)
-    arrays = parts.rows(n_rows) if n_rows is not None else parts.first_episodes(total)
-    attrs = {**describe(name, spec.env, arrays), **_origin(spec, runner), **(extra or {})}
-    write_hdf5(out, arrays, attrs)
     parts.remove()
     seconds, new_rows = time.monotonic() - started, parts.n_rows - rows_before
     return Recorded(out, attrs, seconds, new_rows, score_of(spec.env, attrs), runner.notes())
