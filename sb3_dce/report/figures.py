@@ -23,12 +23,14 @@ from sb3_dce.report.behaviour import Behaviour
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
 MAX_POINTS = 2_000
 MAX_SAMPLE = 50_000
 MAX_STEP_BINS = 200
 MAX_HISTOGRAMS = 36
 N_BINS = 40
+N_COLUMNS = 6
 N_DENSITY_BINS = 100
 
 # Stand-ins that matplotlib accepts; each becomes a variable of the page.
@@ -122,7 +124,10 @@ def _style() -> Iterator[None]:
 def _figure(width: float = 5.2, height: float = 3.1) -> Figure:
     from matplotlib.figure import Figure  # no pyplot: no window system is touched
 
-    return Figure(figsize=(width, height), layout="constrained")
+    figure = Figure(figsize=(width, height))
+    # Fixed margins, wide enough for any tick label: fitting them would double the time of a page.
+    figure.subplots_adjust(left=0.7 / width, right=1 - 0.1 / width, bottom=0.5 / height, top=1 - 0.1 / height, hspace=0.15)
+    return figure
 
 
 def _svg(figure: Figure, label: str) -> str:
@@ -141,7 +146,7 @@ def _svg(figure: Figure, label: str) -> str:
     text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
     text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)
     # The names of groups (figure_1, axes_1) are the same in every picture, and nothing refers to them.
-    text = re.sub(r' id="[a-z0-9A-Z]+_\d+"', "", text)
+    text = re.sub(r' id="[\w.]+_\d+"', "", text)
     return text.replace("<svg", f'<svg role="img" aria-label="{label}"', 1)
 
 
@@ -165,6 +170,7 @@ def _histogram(title: str, values: np.ndarray, label: str, caption: str) -> Plot
     axes.axvline(float(values.mean()), color=_ACCENT, linewidth=1.5, label=f"mean {values.mean():.4g}")
     axes.set_xlabel(label)
     axes.set_ylabel("episodes")
+    axes.yaxis.set_major_locator(_integer_ticks())
     axes.legend()
     return Plot(title, _svg(figure, title), caption)
 
@@ -177,9 +183,9 @@ def _returns(transitions: Transitions) -> Plot:
 
 def _lengths(transitions: Transitions) -> Plot:
     lengths = transitions.info.episode_lengths
-    caption = f"Steps of the same episodes, {lengths.min():,} to {lengths.max():,}. Short ones end at a terminal."
-    if transitions.info.n_terminals == 0:
-        caption = f"Steps of the same episodes, {lengths.min():,} to {lengths.max():,}. None ends at a true terminal."
+    span = f"{lengths.min():,} to {lengths.max():,}" if lengths.min() < lengths.max() else f"always {lengths.max():,}"
+    ends = "Short ones end at a terminal" if transitions.info.n_terminals else "None ends at a true terminal"
+    caption = f"Steps of the same episodes, {span}. {ends}."
     return _histogram("Episode lengths", lengths, "steps", caption)
 
 
@@ -250,32 +256,40 @@ def _saturation(transitions: Transitions) -> Plot:
 
 
 def _action_histograms(transitions: Transitions) -> Plot:
+    from matplotlib.collections import PolyCollection
+
     info = transitions.info
     shown = min(transitions.act_dim, MAX_HISTOGRAMS)
-    n_columns = min(shown, 6)
+    low, high = info.action_space_low.astype(np.float64), info.action_space_high.astype(np.float64)
+    counts = np.zeros((shown, N_BINS))
+    for block in row_blocks(len(transitions)):
+        bins = ((transitions.actions[block] - low) * (N_BINS / (high - low))).astype(np.int64).clip(0, N_BINS - 1)
+        for entry in range(shown):
+            counts[entry] += np.bincount(bins[:, entry], minlength=N_BINS)
+    heights = counts / counts.max(axis=1, keepdims=True)
+    # One set of axes with a cell of width 1 and height 1 per entry: sets of axes of their own take ten times as long.
+    n_columns = min(shown, N_COLUMNS)
     n_rows = -(-shown // n_columns)
-    figure = _figure(10.8 if n_columns > 2 else 5.2, 0.5 + 1.25 * n_rows if n_rows > 1 else 2.2)
-    grid = figure.subplots(n_rows, n_columns, squeeze=False, sharey=True).ravel()
-    for entry, axes in enumerate(grid):
-        if entry >= shown:
-            axes.set_visible(False)
-            continue
-        limits = float(info.action_space_low[entry]), float(info.action_space_high[entry])
-        edges = np.linspace(*limits, N_BINS + 1)
-        counts = np.zeros(N_BINS)
-        for block in row_blocks(len(transitions)):
-            counts += np.histogram(transitions.actions[block, entry], edges)[0]
-        axes.stairs(counts / counts.sum(), edges, fill=True, color=_MAIN)
-        axes.set_title(f"entry {entry}", fontsize=8, pad=2)
-        axes.tick_params(labelsize=7)
-        ticks = [limits[0], sum(limits) / 2, limits[1]]
-        axes.set_xticks(ticks, [f"{tick:.3g}" for tick in ticks])
-        axes.set_yticks([])
-        axes.set_xlim(*limits)
-    caption = "Distribution of each action entry between its bounds, all with one vertical scale."
+    figure = _figure(1.8 * n_columns, 1.5 * n_rows)
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.set_axis_off()
+    axes.set_xlim(-0.1, 1.2 * n_columns - 0.1)
+    axes.set_ylim(1.5 - 1.5 * n_rows - 0.25, 1.25)
+    outlines = []
+    for entry in range(shown):
+        left, bottom = 1.2 * (entry % n_columns), -1.5 * (entry // n_columns)
+        edges = left + np.repeat(np.arange(N_BINS + 1) / N_BINS, 2)
+        tops = bottom + np.concatenate([[0.0], np.repeat(heights[entry], 2), [0.0]])
+        outlines.append(np.column_stack([edges, tops]))
+        axes.plot([left, left + 1], [bottom, bottom], color=_INK, linewidth=0.8)
+        axes.text(left + 0.5, bottom + 1.05, f"entry {entry}", ha="center", fontsize=8)
+        axes.text(left, bottom - 0.05, f"{low[entry]:.3g}", ha="left", va="top", fontsize=7)
+        axes.text(left + 1, bottom - 0.05, f"{high[entry]:.3g}", ha="right", va="top", fontsize=7)
+    axes.add_collection(PolyCollection(outlines, facecolor=_MAIN, edgecolor="none"))
+    caption = "Distribution of each action entry between its bounds, the highest bar at full height."
     if shown < transitions.act_dim:
         caption += f" The first {shown} of {transitions.act_dim} entries."
-    return Plot("Action histograms", _svg(figure, "Action histograms"), caption, wide=n_columns > 2)
+    return Plot("Action histograms", _svg(figure, "Action histograms"), caption, wide=n_columns > 3)
 
 
 def _coverage(title: str, noun: str, rows: np.ndarray, n: int) -> Plot:
@@ -361,7 +375,11 @@ def _randomness(behaviour: Behaviour) -> Plot:
 
 
 def _integer_axis(axes: Axes) -> None:
+    axes.xaxis.set_major_locator(_integer_ticks())
+    axes.grid(axis="x", visible=False)
+
+
+def _integer_ticks() -> MaxNLocator:
     from matplotlib.ticker import MaxNLocator
 
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.grid(axis="x", visible=False)
+    return MaxNLocator(integer=True)
