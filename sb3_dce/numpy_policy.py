@@ -11,7 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from gymnasium import spaces
@@ -19,6 +19,7 @@ from gymnasium import spaces
 from sb3_dce.errors import ConfigError
 
 Layer = tuple[np.ndarray, np.ndarray]
+Squash = Literal["draw", "mean", "none"]
 
 # Bounds of the log standard deviation of Stable-Baselines3's SAC actor.
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
@@ -125,7 +126,8 @@ class MLPPolicy(NumpyPolicy):
     :param activation: key of :data:`ACTIVATIONS`, of all layers but the last
     :param low: smallest action, shape (act_dim,)
     :param high: largest action, shape (act_dim,)
-    :param squash: tanh, then from [-1, 1] to the box (SAC, TD3); otherwise clipped to the box (PPO)
+    :param squash: ``"draw"``: tanh of mean plus noise, from [-1, 1] to the box (SAC, TD3); ``"mean"``: tanh of the mean, to
+        which noise is added, clipped to [-1, 1] and taken to the box (IQL); ``"none"``: clipped to the box (PPO)
     :param log_std: of the Gaussian before squashing: a layer on the last hidden units, clipped to [-20, 2] as in SAC; or a
         vector, as in PPO; ``None`` for a policy without noise of its own (TD3)
     :param normalizer: applied to the observation, the time included
@@ -139,7 +141,7 @@ class MLPPolicy(NumpyPolicy):
         activation: str,
         low: np.ndarray,
         high: np.ndarray,
-        squash: bool,
+        squash: Squash,
         log_std: Layer | np.ndarray | None = None,
         normalizer: ObsNormalizer | None = None,
         time_limit: int | None = None,
@@ -154,26 +156,28 @@ class MLPPolicy(NumpyPolicy):
         self.log_std = log_std
         self._hidden, self._mean = self.layers[:-1], self.layers[-1]
         self._has_std_layer = isinstance(log_std, tuple)
+        self._std: np.ndarray | None = None
         if isinstance(log_std, tuple):
             self.log_std = weight, bias = _float64(log_std)
             # one product for mean and log std is faster than two
             self._both = (np.ascontiguousarray(np.hstack([self._mean[0], weight])), np.concatenate([self._mean[1], bias]))
         elif log_std is not None:
             self._std = np.exp(np.asarray(log_std, dtype=np.float64))
-        if squash:
+        if squash != "none":
             self._middle, self._half_range = (self.high + self.low) / 2, (self.high - self.low) / 2
 
     def act(self, obs: np.ndarray, noise: np.ndarray | None = None, step: int = 0) -> np.ndarray:
-        mean, std = self.distribution(obs, step, with_std=noise is not None)
+        drawn, std = self.distribution(obs, step, with_std=noise is not None)
         if noise is not None and std is not None:
-            mean = mean + std * noise
-        if self.squash:
-            return self._middle + self._half_range * np.tanh(mean)
-        return np.minimum(np.maximum(mean, self.low), self.high)
+            drawn = drawn + std * noise
+        if self.squash == "none":
+            return np.minimum(np.maximum(drawn, self.low), self.high)
+        scaled = np.tanh(drawn) if self.squash == "draw" else np.minimum(np.maximum(drawn, -1.0), 1.0)
+        return self._middle + self._half_range * scaled
 
     def distribution(self, obs: np.ndarray, step: int = 0, with_std: bool = True) -> tuple[np.ndarray, np.ndarray | None]:
         """
-        The Gaussian before squashing or clipping.
+        The Gaussian that noise is drawn from, before a draw is squashed or clipped.
 
         :param obs: shape (n, obs_dim)
         :param step: steps since the start of the episode
@@ -190,10 +194,9 @@ class MLPPolicy(NumpyPolicy):
             x = x @ weight
             x += bias
             x = activation(x)
-        if not (with_std and self.is_stochastic):
-            return x @ self._mean[0] + self._mean[1], None
-        if not self._has_std_layer:
-            return x @ self._mean[0] + self._mean[1], self._std
+        if not (with_std and self._has_std_layer):
+            mean = x @ self._mean[0] + self._mean[1]
+            return np.tanh(mean) if self.squash == "mean" else mean, self._std if with_std else None
         both = x @ self._both[0] + self._both[1]
         log_std = np.minimum(np.maximum(both[:, self.act_dim :], LOG_STD_MIN), LOG_STD_MAX)
         return both[:, : self.act_dim], np.exp(log_std)
@@ -284,7 +287,7 @@ def numpy_policy(policy: Any, normalizer: ObsNormalizer | None = None) -> MLPPol
     """
     The NumPy twin of a policy of Stable-Baselines3 or of this package.
 
-    Known are the MLP policies of SAC, TQC, TD3, DDPG, PPO, A2C and TRPO, and those of the offline agents, with their
+    Known are the MLP policies of SAC, TQC, TD3, DDPG, PPO, A2C and TRPO, and those of the offline agents, with or without
     standardised observations. Classes are compared exactly: a subclass may act in another way.
 
     :param policy: ``model.policy``
@@ -313,8 +316,8 @@ def numpy_policy(policy: Any, normalizer: ObsNormalizer | None = None) -> MLPPol
 _UNKNOWN: Any = object()
 
 
-def _actor_parts(policy: Any) -> tuple[list[Any], Layer | np.ndarray | None, Any, bool] | None:
-    """Modules of the mean, log std, features extractor, and whether tanh follows; ``None`` for an unknown policy."""
+def _actor_parts(policy: Any) -> tuple[list[Any], Layer | np.ndarray | None, Any, Squash] | None:
+    """Modules of the mean, log std, features extractor, and the way of squashing; ``None`` for an unknown policy."""
     from stable_baselines3.common.distributions import DiagGaussianDistribution
     from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
     from stable_baselines3.common.torch_layers import MlpExtractor
@@ -322,21 +325,29 @@ def _actor_parts(policy: Any) -> tuple[list[Any], Layer | np.ndarray | None, Any
     from stable_baselines3.td3.policies import Actor as TD3Actor
     from stable_baselines3.td3.policies import TD3Policy
 
-    known = (SACPolicy._predict, TD3Policy._predict, ActorCriticPolicy._predict, *_contrib())
+    from sb3_dce.actors import LOG_STD_MAX as IQL_LOG_STD_MAX
+    from sb3_dce.actors import LOG_STD_MIN as IQL_LOG_STD_MIN
+    from sb3_dce.actors import DeterministicActor, GaussianActor
+    from sb3_dce.policies import OfflineTD3Policy
+
+    known = (SACPolicy._predict, TD3Policy._predict, OfflineTD3Policy._predict, ActorCriticPolicy._predict, *_contrib())
     if type(policy).predict is not BasePolicy.predict or type(policy)._predict not in known:
         return None
     actor: Any = getattr(policy, "actor", None)
     if type(actor) in _squashed_gaussian_actors() and not actor.use_sde:
-        return [*actor.latent_pi, actor.mu], _layer(actor.log_std), actor.features_extractor, True
-    if type(actor) is TD3Actor and _is_tanh(actor.mu[-1]):
-        return list(actor.mu)[:-1], None, actor.features_extractor, True
+        return [*actor.latent_pi, actor.mu], _layer(actor.log_std), actor.features_extractor, "draw"
+    if type(actor) in (TD3Actor, DeterministicActor) and _is_tanh(actor.mu[-1]):
+        return list(actor.mu)[:-1], None, actor.features_extractor, "draw"
+    if type(actor) is GaussianActor:
+        log_std = np.clip(actor.log_std.detach().cpu().numpy(), IQL_LOG_STD_MIN, IQL_LOG_STD_MAX)
+        return [*actor.latent_pi, actor.mu], log_std, actor.features_extractor, "mean"
     if (
         type(policy) is ActorCriticPolicy
         and type(policy.mlp_extractor) is MlpExtractor
         and type(policy.action_dist) is DiagGaussianDistribution
     ):
         modules = [*policy.mlp_extractor.policy_net, policy.action_net]
-        return modules, policy.log_std.detach().cpu().numpy(), policy.pi_features_extractor, False
+        return modules, policy.log_std.detach().cpu().numpy(), policy.pi_features_extractor, "none"
     return None
 
 

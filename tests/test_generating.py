@@ -32,7 +32,7 @@ def write_policy(path: Path, dims: tuple[int, int], seed: int = 0) -> Path:
     rng = np.random.default_rng(seed)
     layers = [(0.3 * rng.normal(size=(dims[0], 8)), np.zeros(8)), (0.3 * rng.normal(size=(8, dims[1])), np.zeros(dims[1]))]
     box = np.ones(dims[1])
-    policy = MLPPolicy(layers, "tanh", -box, box, squash=True, log_std=np.full(dims[1], -1.0))
+    policy = MLPPolicy(layers, "tanh", -box, box, squash="draw", log_std=np.full(dims[1], -1.0))
     path.parent.mkdir(exist_ok=True)
     write_npz_policy(policy, path, {"algo": "test", "source": f"seed {seed}", "licence": "MIT"})
     return path

@@ -17,9 +17,11 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torch import nn
 
-from sb3_dce import OfflineBC, OfflineDCE, Transitions
+from sb3_dce import Transitions
+from sb3_dce.agents import AGENTS
 from sb3_dce.envs import SpacesEnv
 from sb3_dce.errors import CheckpointError, ConfigError
+from sb3_dce.iql import OfflineIQL
 from sb3_dce.numpy_policy import MLPPolicy, ObsNormalizer, PredictPolicy, RandomPolicy, numpy_policy
 from sb3_dce.recording.policy_files import detect_algo, load_policy, read_npz_policy, write_npz_policy
 
@@ -76,7 +78,7 @@ def random_mlp(log_std: bool = True) -> MLPPolicy:
     layers = [(rng.normal(size=shape).astype(np.float32), rng.normal(size=shape[1])) for shape in ((5, 8), (8, 2))]
     layers = [(weight, bias.astype(np.float32)) for weight, bias in layers]
     std = (rng.normal(size=(8, 2)).astype(np.float32), rng.normal(size=2).astype(np.float32)) if log_std else None
-    return MLPPolicy(layers, "relu", -np.ones(2), np.ones(2), squash=True, log_std=std)
+    return MLPPolicy(layers, "relu", -np.ones(2), np.ones(2), squash="draw", log_std=std)
 
 
 def twin(model: Any, normalizer: ObsNormalizer | None = None) -> MLPPolicy:
@@ -122,22 +124,35 @@ def test_td3_has_no_noise_of_its_own(models: dict[str, Any]) -> None:
     assert np.array_equal(policy.act(OBS, np.ones((40, 2))), policy.act(OBS))
 
 
-@pytest.mark.parametrize("agent", [OfflineDCE, OfflineBC])
-def test_offline_agents_with_standardised_observations(
-    agent: Any, random_transitions: Callable[..., Transitions], tmp_path: Path
-) -> None:
-    model = agent(
-        "MlpPolicy",
-        dataset=random_transitions(),
-        normalize_obs=True,
-        policy_kwargs={"net_arch": [8]},
-        execution="eager",
-        seed=0,
+@pytest.fixture(scope="module")
+def wide_data(random_transitions: Callable[..., Transitions]) -> Transitions:
+    return random_transitions(high=2.0)
+
+
+@pytest.mark.parametrize("algo", AGENTS)
+@pytest.mark.parametrize("normalize_obs", [False, True])
+def test_offline_agents_are_taken_out(algo: str, normalize_obs: bool, wide_data: Transitions, tmp_path: Path) -> None:
+    kwargs = {"net_arch": [8]}
+    model = AGENTS[algo](
+        "MlpPolicy", dataset=wide_data, normalize_obs=normalize_obs, policy_kwargs=kwargs, execution="eager", seed=0
     ).learn(2)
     model.save(tmp_path / "agent.zip")
     policy, facts = load_policy(str(tmp_path / "agent.zip"), model.observation_space, model.action_space)
-    assert isinstance(policy, MLPPolicy) and policy.normalizer is not None and agent.algo_name in facts.name
-    assert np.abs(policy.act(OBS) - model.predict(OBS, deterministic=True)[0]).max() <= TOLERANCE
+    assert isinstance(policy, MLPPolicy) and (policy.normalizer is not None) == normalize_obs
+    expected, _ = model.predict(OBS, deterministic=True)
+    assert np.abs(policy.act(OBS) - expected).max() <= TOLERANCE and np.abs(expected).max() <= 2.0
+    assert algo in facts.name
+
+
+def test_iql_noise_is_added_to_the_squashed_mean_and_clipped(wide_data: Transitions) -> None:
+    model = OfflineIQL("MlpPolicy", dataset=wide_data, policy_kwargs={"net_arch": [8]}, execution="eager", seed=0).learn(1)
+    with th.no_grad():
+        model.policy.actor.log_std.copy_(th.tensor([9.0, -9.0]))
+        mean, log_std = model.policy.actor.get_action_dist_params(th.as_tensor(OBS, dtype=th.float32))
+    assert log_std.tolist() == [2.0, -5.0]
+    noise = np.random.default_rng(0).normal(size=(40, 2))
+    expected = 2.0 * np.clip(mean.numpy() + np.exp(log_std.numpy()) * noise, -1, 1)
+    assert np.abs(twin(model).act(OBS, noise) - expected).max() <= TOLERANCE
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)

@@ -33,7 +33,7 @@ def hopper_npz(path: Path, seed: int = 0) -> Path:
     layers = [(0.3 * rng.normal(size=(11, 16)), np.zeros(16)), (0.3 * rng.normal(size=(16, 3)), np.zeros(3))]
     std = (0.1 * rng.normal(size=(16, 3)), np.full(3, -1.0))
     write_npz_policy(
-        MLPPolicy(layers, "tanh", -np.ones(3), np.ones(3), squash=True, log_std=std),
+        MLPPolicy(layers, "tanh", -np.ones(3), np.ones(3), squash="draw", log_std=std),
         path,
         {"algo": "sac", "source": "a test", "licence": "MIT"},
     )

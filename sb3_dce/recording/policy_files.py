@@ -29,6 +29,7 @@ from sb3_dce.numpy_policy import (
     ObsNormalizer,
     PredictPolicy,
     RandomPolicy,
+    Squash,
     numpy_policy,
 )
 
@@ -146,7 +147,7 @@ def write_npz_policy(policy: MLPPolicy, path: Path, meta: dict[str, Any]) -> Non
     :param path: file to write, atomically
     :param meta: what is known about it besides its layout: algo, env, source, licence, ...
     """
-    assert policy.normalizer is None and policy.time_limit is None
+    assert policy.normalizer is None and policy.time_limit is None and policy.squash != "mean"
     assert (policy.low == -1).all() and (policy.high == 1).all()
     arrays: dict[str, Any] = {}
     for number, (weight, bias) in enumerate(policy.layers):
@@ -155,7 +156,12 @@ def write_npz_policy(policy: MLPPolicy, path: Path, meta: dict[str, Any]) -> Non
         arrays["logstd_w"], arrays["logstd_b"] = (part.T.astype(np.float32) for part in policy.log_std)
     elif policy.log_std is not None:
         arrays["log_std"] = policy.log_std.astype(np.float32)
-    layout = {"activation": policy.activation, "squash": policy.squash, "time_feature": False, "n_layers": len(policy.layers)}
+    layout = {
+        "activation": policy.activation,
+        "squash": policy.squash == "draw",
+        "time_feature": False,
+        "n_layers": len(policy.layers),
+    }
     arrays["meta"] = np.frombuffer(json.dumps({**meta, **layout}).encode(), dtype=np.uint8)
     with write_atomically(path) as stream:
         np.savez(stream, **arrays)
@@ -172,7 +178,7 @@ def _policy_of_arrays(arrays: dict[str, np.ndarray]) -> tuple[MLPPolicy, dict[st
         scale = arrays["out_scale"].astype(np.float64)
         head = (weight * scale, bias * scale + arrays["out_shift"])
         normalizer = ObsNormalizer(arrays["in_shift"].astype(np.float64), arrays["in_scale"].astype(np.float64) + 1e-8)
-        policy = MLPPolicy([*layers[:-1], head], "tanh", -box, box, False, arrays["log_std"], normalizer)
+        policy = MLPPolicy([*layers[:-1], head], "tanh", -box, box, "none", arrays["log_std"], normalizer)
         return policy, {"algo": "dapg"}
     meta = json.loads(bytes(arrays["meta"]))
     if meta["activation"] not in ACTIVATIONS or meta["n_layers"] != n_layers:
@@ -186,7 +192,8 @@ def _policy_of_arrays(arrays: dict[str, np.ndarray]) -> tuple[MLPPolicy, dict[st
         scale = np.sqrt(arrays["obs_var"].astype(np.float64) + arrays["norm_eps"])
         statistics = ObsNormalizer(arrays["obs_mean"].astype(np.float64), scale, float(arrays["clip_obs"]))
     time_limit = _TIME_LIMIT if meta["time_feature"] else None
-    return MLPPolicy(layers, meta["activation"], -box, box, bool(meta["squash"]), log_std, statistics, time_limit), meta
+    squash: Squash = "draw" if meta["squash"] else "none"
+    return MLPPolicy(layers, meta["activation"], -box, box, squash, log_std, statistics, time_limit), meta
 
 
 def _check_numbers(arrays: dict[str, np.ndarray]) -> None:
