@@ -71,7 +71,7 @@ def _failed(name: str, what: str) -> DownloadError:
     return DownloadError(
         f"not downloaded. {what}",
         where=f"dataset {name}",
-        hint=f"Try again later; or run `minari download {minari_id(name)}` on a machine with network and copy the folder that it "
+        hint=f"Try again later; or run `minari download {minari_id(name)}` on a machine with network and copy the folder it "
         f"makes to {folder.parent} (${ROOT_VARIABLE} names another root).",
         path=folder,
         key=name,

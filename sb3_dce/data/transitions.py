@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
@@ -16,7 +16,7 @@ from sb3_dce.data.catalog import DatasetSpec, normalized_score
 from sb3_dce.data.hashes import content_hash, file_sha256
 from sb3_dce.data.hdf5 import D4RLFile, write_hdf5
 from sb3_dce.data.layout import CORE_KEYS, ArraySource, RowLayout
-from sb3_dce.data.minari import Flatten, action_bounds, find_minari, reward_note
+from sb3_dce.data.minari import METADATA_FILE, Flatten, action_bounds, find_minari, reward_note
 from sb3_dce.data.minari_episodes import open_episodes
 from sb3_dce.data.npz import arrays_from_npz, npz_keys, write_npz
 from sb3_dce.data.records import DatasetInfo, ReadOptions
@@ -256,9 +256,20 @@ class Transitions:
         if not any(options.get(key) is not None for key in ("action_low", "action_high", "action_scale")):
             options |= bounds
         read_options = ReadOptions(**options)
-        with open_episodes(dataset, flatten, read_options.max_bytes) as (sources, notes):
-            notes += reward_note(dataset.name)
-            return cls._build(sources, dataset.name, dataset.file, sources, None, read_options, notes)
+
+        def read() -> BuiltRows:
+            with open_episodes(dataset, flatten, read_options.max_bytes) as (sources, notes):
+                built = build_rows(
+                    sources, dataset_id=dataset.name, path=dataset.file, found_keys=sources, spec=None, options=read_options
+                )
+            info = replace(built.info, notes=(*notes, *reward_note(dataset.name), *built.info.notes))
+            return built._replace(info=info)
+
+        if dataset.data_format != "hdf5":  # many files: the hash of none of them would notice a change of the others
+            return cls._of(read())
+        reader = {"name": "minari", "flatten": flatten, "metadata": file_sha256(dataset.folder / METADATA_FILE)}
+        built = cached_rows(dataset.file, None, read_options, reader, read)
+        return cls._of(built._replace(info=replace(built.info, id=dataset.name)))
 
     @classmethod
     def _from_file(
@@ -289,17 +300,16 @@ class Transitions:
         found_keys: Any,
         spec: DatasetSpec | None,
         options: ReadOptions,
-        notes: Sequence[str] = (),
     ) -> Transitions:
         built = build_rows(sources, dataset_id=dataset_id, path=path, found_keys=found_keys, spec=spec, options=options)
-        return cls._of(built, notes)
+        return cls._of(built)
 
     @classmethod
-    def _of(cls, built: BuiltRows, notes: Sequence[str] = ()) -> Transitions:
+    def _of(cls, built: BuiltRows) -> Transitions:
         for text in built.info.warnings:
             warnings.warn(f"{built.info.id}: {text}", DatasetWarning, stacklevel=3)
-        layout, info = built.layout, replace(built.info, notes=(*notes, *built.info.notes))
-        return cls(built.rows, built.timeouts, built.episodes, (layout.obs_dim,), layout.act_dim, info)
+        layout = built.layout
+        return cls(built.rows, built.timeouts, built.episodes, (layout.obs_dim,), layout.act_dim, built.info)
 
     def __len__(self) -> int:
         return len(self.rows)
