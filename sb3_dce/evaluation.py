@@ -99,6 +99,15 @@ def evaluate(model: Any, rollouts: Rollouts, seed: int, dataset_id: str | None =
     return Evaluation(int(getattr(model, "_n_updates", 0)), *episodes, dataset_id)
 
 
+def evaluation_seed(run_seed: int, index: int) -> int:
+    """
+    :param run_seed: seed of the run
+    :param index: number of the evaluation within the run
+    :return: seed of its first episode
+    """
+    return SEEDS_PER_EVALUATION * (index + 1000 * run_seed)
+
+
 class EvaluationCallback(BaseCallback):
     """
     Evaluate every so many gradient steps; write ``evaluations.npz`` (Stable-Baselines3's layout) and ``evaluations.csv``.
@@ -146,8 +155,7 @@ class EvaluationCallback(BaseCallback):
         return True
 
     def _evaluate(self, rollouts: Rollouts) -> None:
-        index = self.num_timesteps // self.eval_freq
-        seed = SEEDS_PER_EVALUATION * (index + 1000 * self.seed)
+        seed = evaluation_seed(self.seed, self.num_timesteps // self.eval_freq)
         outcome = evaluate(self.model, rollouts, seed, self.dataset_id)
         kept = [e for e in self.evaluations if e.n_updates < outcome.n_updates]
         self.evaluations = [*kept, outcome]

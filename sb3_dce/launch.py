@@ -18,6 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from sb3_dce import runs
 from sb3_dce.errors import SB3DCEError
+from sb3_dce.evaluation import Evaluation
 from sb3_dce.runs import RunSpec
 
 
@@ -40,7 +41,7 @@ def launch(specs: Sequence[RunSpec], workers: int, console: Console) -> list[dic
     threads = int(os.environ.get("OMP_NUM_THREADS", 0)) or max(1, (os.cpu_count() or 1) // workers)
     context = mp.get_context("spawn")
     events = context.Queue()
-    with _display(console) as display:
+    with progress_display(console) as display:
         with ProcessPoolExecutor(workers, mp_context=context, initializer=_prepare, initargs=(threads, events)) as pool:
             futures = [pool.submit(_run, spec) for spec in specs]
             try:
@@ -55,7 +56,11 @@ def launch(specs: Sequence[RunSpec], workers: int, console: Console) -> list[dic
                 raise
 
 
-def _display(console: Console) -> Progress:
+def progress_display(console: Console) -> Progress:
+    """
+    :param console: where the bars are shown
+    :return: bars with counts, elapsed and remaining time
+    """
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -87,12 +92,18 @@ def _show_until_done(futures: list[Future[Any]], events: Any, specs: Sequence[Ru
             tasks[event.name] = display.add_task(event.name, total=totals[event.name])
         display.update(tasks[event.name], completed=event.n_updates)
         if event.evaluation is not None:
-            outcome = event.evaluation
-            score = "" if outcome.score is None else f"   score {outcome.score:6.1f}"
-            display.console.print(
-                f"  {event.name:<18} @{outcome.n_updates:>8,}   return {outcome.mean:8.1f} ± {outcome.std:6.1f}{score}",
-                highlight=False,
-            )
+            show_evaluation(display.console, event.name, event.evaluation)
+
+
+def show_evaluation(console: Console, name: str, outcome: Evaluation) -> None:
+    """
+    :param console: where to print
+    :param name: short name of the run
+    :param outcome: of one evaluation
+    """
+    score = "" if outcome.score is None else f"   score {outcome.score:6.1f}"
+    line = f"  {name:<18} @{outcome.n_updates:>8,}   return {outcome.mean:8.1f} ± {outcome.std:6.1f}{score}"
+    console.print(line, highlight=False)
 
 
 # Where a worker process reports to; set when it starts, since a queue cannot be sent with each task.

@@ -99,7 +99,7 @@ def run(spec: RunSpec, report: Report = lambda progress: None) -> dict[str, Any]
     :raises SB3DCEError: if something is wrong with data, parameters or files
     """
     folder = Path(spec.folder)
-    _refuse_other_run(spec, folder)
+    refuse_other_run(spec, folder)
     done = read_result(folder)
     if done is not None and done["n_updates"] == spec.n_updates:
         return done
@@ -107,7 +107,7 @@ def run(spec: RunSpec, report: Report = lambda progress: None) -> dict[str, Any]
     model.attach_dataset()
     folder.mkdir(parents=True, exist_ok=True)  # not before: a run that is refused leaves nothing behind
     dataset_id = catalogue_id(model.dataset)
-    _write_config(spec, model, folder)
+    write_config(spec, model, folder)
     model.set_logger(Logger(str(folder), [make_output_format("csv", str(folder), f"_{model.num_timesteps}")]))
 
     def on_evaluation(outcome: Evaluation) -> None:
@@ -125,7 +125,22 @@ def run(spec: RunSpec, report: Report = lambda progress: None) -> dict[str, Any]
     seconds = seconds_before + time.monotonic() - started
     model.save(folder / "model.zip")
     write_evaluations(folder, evaluating.evaluations)
-    last = evaluating.evaluations[-1] if evaluating.evaluations else None
+    result = write_result(spec, folder, evaluating.evaluations, seconds)
+    (folder / "checkpoint.zip").unlink(missing_ok=True)
+    return result
+
+
+def write_result(spec: RunSpec, folder: Path, evaluations: list[Evaluation], seconds: float) -> dict[str, Any]:
+    """
+    Write ``result.json``, the mark of a complete run.
+
+    :param spec: what was run
+    :param folder: where it is written
+    :param evaluations: all evaluations of the run; the last one counts
+    :param seconds: of training
+    :return: the result
+    """
+    last = evaluations[-1] if evaluations else None
     result = {
         "config": _config(spec),
         "n_updates": spec.n_updates,
@@ -136,7 +151,6 @@ def run(spec: RunSpec, report: Report = lambda progress: None) -> dict[str, Any]
         "evaluated_at": None if last is None else last.n_updates,
     }
     _write_text(folder / "result.json", json.dumps(result, indent=1))
-    (folder / "checkpoint.zip").unlink(missing_ok=True)
     return result
 
 
@@ -153,8 +167,14 @@ def _config(spec: RunSpec) -> dict[str, Any]:
     return {key: value for key, value in asdict(spec).items() if key != "folder"}
 
 
-def _refuse_other_run(spec: RunSpec, folder: Path) -> None:
-    """A run is only continued with the settings it was begun with; it may be made longer."""
+def refuse_other_run(spec: RunSpec, folder: Path) -> None:
+    """
+    A run is only continued with the settings it was begun with; it may be made longer.
+
+    :param spec: what is to be run
+    :param folder: where a run may have been begun
+    :raises ConfigError: if that was another one
+    """
     path = folder / "config.yml"
     if not path.is_file():
         return
@@ -203,7 +223,14 @@ def _seconds_before(folder: Path) -> float:
     return total
 
 
-def _write_config(spec: RunSpec, model: OfflineAlgorithm, folder: Path) -> None:
+def write_config(spec: RunSpec, model: OfflineAlgorithm, folder: Path) -> None:
+    """
+    Write ``config.yml``: what is run, on which data, with which versions on what kind of machine.
+
+    :param spec: what is run
+    :param model: its model, with the data attached
+    :param folder: where it is written
+    """
     assert model.dataset is not None
     path, _ = find_file(model.dataset)
     hyperparameters = {name: _plain(value) for name, value in model.hyperparameters().items()}

@@ -1,0 +1,246 @@
+"""
+``train_population``: many runs, each in its own folder, trained in one batched computation on a GPU.
+
+What a run writes is what :func:`sb3_dce.runs.run` writes, so results, plots and resuming know no difference. On a CPU the
+same runs are processes, one per core.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from rich.console import Console
+from rich.progress import Progress, TaskID
+from stable_baselines3.common.logger import Logger, make_output_format
+from stable_baselines3.common.utils import get_device
+
+from sb3_dce.agents import agent_class
+from sb3_dce.base import OfflineAlgorithm
+from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError
+from sb3_dce.evaluation import (
+    Evaluation,
+    catalogue_id,
+    evaluate,
+    evaluation_seed,
+    make_rollouts,
+    read_evaluations,
+    write_evaluations,
+)
+from sb3_dce.files import write_atomically
+from sb3_dce.launch import launch, progress_display, show_evaluation
+from sb3_dce.population import Population
+from sb3_dce.rollouts import Rollouts
+from sb3_dce.runs import RunSpec, read_result, refuse_other_run, write_config, write_result
+
+# Beside the members' folders: how far all have come, and the state of the common random generator.
+STATE_FILE = "population.pt"
+UPDATES_PER_REPORT = 1000
+
+
+def train_population(
+    specs: Sequence[RunSpec],
+    *,
+    device: th.device | str = "auto",
+    execution: str = "auto",
+    workers: int = 1,
+    console: Console | None = None,
+) -> list[dict[str, Any]]:
+    """
+    Train many models at once; the same call goes on with what was interrupted.
+
+    :param specs: runs of one algorithm with spaces of one shape, of the same length and evaluation frequency, each with a
+        folder of its own inside a common one. They may differ in dataset, seed, and numbers such as beta
+    :param device: ``"cpu"`` makes each run a process; on ``"cuda"`` they are one batched computation
+    :param execution: as in :class:`~sb3_dce.base.OfflineAlgorithm`
+    :param workers: processes on the CPU
+    :param console: where progress is shown; ``None`` shows nothing
+    :return: results in the order of ``specs``
+    :raises ConfigError: if the runs cannot be trained together
+    :raises SB3DCEError: if something is wrong with data, parameters or files
+    """
+    console = console or Console(quiet=True)
+    device = get_device(device)
+    if device.type == "cpu":
+        return launch(specs, workers, console)
+    return BatchedRuns(specs, device, execution, console).run()
+
+
+class BatchedRuns:
+    """
+    Runs as one population.
+
+    :param specs: as for :func:`train_population`
+    :param device: where the training happens
+    :param execution: as in :class:`~sb3_dce.base.OfflineAlgorithm`
+    :param console: where progress is shown
+    :param own_randomness: see :class:`~sb3_dce.population.Population`
+    :raises ConfigError: if the runs cannot be trained together
+    """
+
+    def __init__(
+        self,
+        specs: Sequence[RunSpec],
+        device: th.device,
+        execution: str,
+        console: Console,
+        own_randomness: bool = False,
+    ) -> None:
+        self.specs, self.console = list(specs), console
+        for name in ("algo", "n_updates", "eval_freq", "n_eval_episodes"):
+            values = {getattr(spec, name) for spec in specs}
+            if len(values) != 1:
+                raise ConfigError(
+                    f"runs of one population share {name}, got {sorted(values)}", key=name, hint="Train others apart."
+                )
+        self.total, self.eval_freq = specs[0].n_updates, specs[0].eval_freq
+        self.folders = [Path(spec.folder) for spec in specs]
+        parents = {folder.parent for folder in self.folders}
+        if len(parents) != 1 or len(set(self.folders)) != len(specs):
+            raise ConfigError(
+                "each run of a population has a folder of its own in one common folder",
+                key="folder",
+                hint="For example runs/gym/<dataset>-<seed>.",
+            )
+        self.common = parents.pop()
+        for spec, folder in zip(specs, self.folders, strict=True):
+            refuse_other_run(spec, folder)
+        self._device, self._execution, self._own_randomness = device, execution, own_randomness
+        self._rollouts: dict[str, Rollouts | None] = {}
+        self._diverged: dict[int, int] = {}
+        self._loggers: list[Logger] = []
+        self._seconds_before = 0.0
+
+    def run(self) -> list[dict[str, Any]]:
+        """
+        :return: results in the order of the specifications
+        """
+        done = [read_result(folder) for folder in self.folders]
+        if all(result is not None and result["n_updates"] == self.total for result in done):
+            return [result for result in done if result is not None]
+        population = self._population()
+        self._say_memory(population)
+        started = time.monotonic() - self._seconds_before
+        with progress_display(self.console) as display:
+            task = display.add_task(
+                f"{len(self.specs)} x {self.specs[0].algo}", total=self.total, completed=population.n_updates
+            )
+            while population.n_updates < self.total:
+                self._train_until_due(population, display, task)
+                self._log_metrics(population)
+                models = population.commit()
+                if population.n_updates % self.eval_freq == 0:
+                    self._evaluate(models, population.n_updates)
+                self._save(population, time.monotonic() - started)
+        return self._finish(population, time.monotonic() - started)
+
+    def _train_until_due(self, population: Population, display: Progress, task: TaskID) -> None:
+        due = min(self.total, (population.n_updates // self.eval_freq + 1) * self.eval_freq)
+        while population.n_updates < due:
+            population.train(min(UPDATES_PER_REPORT, due - population.n_updates), self.total)
+            display.update(task, completed=population.n_updates)
+
+    # -- beginning and going on ------------------------------------------------------------------------------------
+
+    def _population(self) -> Population:
+        agent, state = agent_class(self.specs[0].algo), self.common / STATE_FILE
+        saved = th.load(state, weights_only=True) if state.is_file() else None
+        models: list[OfflineAlgorithm] = []
+        for spec, folder in zip(self.specs, self.folders, strict=True):
+            if saved is None:
+                model = agent.load_dataset(spec.dataset, seed=spec.seed, device="cpu", **spec.overrides)
+                model.num_timesteps = 0
+            else:
+                model = agent.load(folder / _checkpoint(saved["n_updates"]), device="cpu")
+                model.set_dataset(spec.dataset)
+            models.append(model)
+        population = Population(models, self._device, self._execution, self._own_randomness, seed=self.specs[0].seed)
+        if saved is not None:
+            if len(saved["random_state"]) != len(population.random_state()):
+                raise CheckpointError(
+                    "the checkpoint was made on another kind of device", where=str(state), hint="Go on there, or begin anew."
+                )
+            population.set_random_state(saved["random_state"])
+            self._seconds_before = saved["seconds"]
+        for spec, model, folder in zip(self.specs, models, self.folders, strict=True):
+            folder.mkdir(parents=True, exist_ok=True)
+            write_config(spec, model, folder)
+            self._loggers.append(Logger(str(folder), [make_output_format("csv", str(folder), f"_{population.n_updates}")]))
+        return population
+
+    def _say_memory(self, population: Population) -> None:
+        memory = {name: size / 2**20 for name, size in population.memory().items()}
+        parts = ", ".join(f"{name} {size:,.0f} MiB" for name, size in memory.items())
+        self.console.print(
+            f"{len(population)} models of {self.specs[0].algo} on {population.device}: {parts}", highlight=False
+        )
+
+    # -- at every evaluation ---------------------------------------------------------------------------------------
+
+    def _log_metrics(self, population: Population) -> None:
+        for index, (metrics, logger) in enumerate(zip(population.read_metrics(), self._loggers, strict=True)):
+            for name, value in metrics.items():
+                logger.record(f"train/{name}", value)
+            logger.dump(population.n_updates)
+            if index not in self._diverged and not np.isfinite(list(metrics.values())).all():
+                self._diverged[index] = population.n_updates
+                self.console.print(f"  {self.specs[index].name} diverged before update {population.n_updates:,}")
+
+    def _evaluate(self, models: Sequence[OfflineAlgorithm], n_updates: int) -> None:
+        for index, (spec, model, folder) in enumerate(zip(self.specs, models, self.folders, strict=True)):
+            dataset_id = catalogue_id(model.dataset)
+            if dataset_id is None or index in self._diverged:
+                continue
+            if dataset_id not in self._rollouts:
+                self._rollouts[dataset_id] = make_rollouts(dataset_id, spec.n_eval_episodes)
+            rollouts = self._rollouts[dataset_id]
+            if rollouts is None:
+                continue
+            seed = evaluation_seed(spec.seed, n_updates // spec.eval_freq)
+            outcome: Evaluation = evaluate(model, rollouts, seed, dataset_id)
+            earlier = [e for e in read_evaluations(folder, dataset_id) if e.n_updates < n_updates]
+            write_evaluations(folder, [*earlier, outcome])
+            show_evaluation(self.console, spec.name, outcome)
+
+    def _save(self, population: Population, seconds: float) -> None:
+        """All members, then the file that says so; what is older goes last. A kill at any point leaves a whole set."""
+        n = population.n_updates
+        for index, (model, folder) in enumerate(zip(population.models, self.folders, strict=True)):
+            model.num_timesteps = n
+            if index not in self._diverged:
+                model.save(folder / _checkpoint(n))
+        if self._diverged:
+            return  # a member that cannot be saved cannot be resumed: the last whole set stays
+        with write_atomically(self.common / STATE_FILE) as stream:
+            th.save({"n_updates": n, "random_state": population.random_state(), "seconds": seconds}, stream)
+        for folder in self.folders:
+            for path in folder.glob("checkpoint_*.zip"):
+                if path.name != _checkpoint(n):
+                    path.unlink()
+
+    def _finish(self, population: Population, seconds: float) -> list[dict[str, Any]]:
+        results = []
+        for index, (spec, model, folder) in enumerate(zip(self.specs, population.models, self.folders, strict=True)):
+            if index not in self._diverged:
+                model.save(folder / "model.zip")
+                results.append(write_result(spec, folder, read_evaluations(folder, catalogue_id(model.dataset)), seconds))
+        (self.common / STATE_FILE).unlink(missing_ok=True)
+        for folder in self.folders:
+            for path in folder.glob("checkpoint_*.zip"):
+                path.unlink()
+        if self._diverged:
+            names = ", ".join(f"{self.specs[index].name} (update {n:,})" for index, n in self._diverged.items())
+            raise DivergenceError(
+                f"{len(self._diverged)} of {len(self.specs)} members diverged: {names}; the others are complete",
+                where=str(self.common),
+                hint="Lower their learning_rate or raise beta.",
+            )
+        return results
+
+
+def _checkpoint(n_updates: int) -> str:
+    return f"checkpoint_{n_updates}.zip"

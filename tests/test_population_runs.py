@@ -1,0 +1,106 @@
+"""Runs of a population: folders like those of single runs, kills and resumes, members that diverge."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch as th
+from rich.console import Console
+from update_tools import all_tensors, largest_difference
+
+from sb3_dce import OfflineDCE
+from sb3_dce.errors import ConfigError, DivergenceError
+from sb3_dce.population_runs import STATE_FILE, BatchedRuns, train_population
+from sb3_dce.runs import RunSpec
+
+TINY = "halfcheetah-tiny-sb3"
+QUICK = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 16}
+CPU = th.device("cpu")
+
+
+def specs(folder: Path, n: int = 2, n_updates: int = 40, **overrides: Any) -> list[RunSpec]:
+    return [
+        RunSpec("dce", TINY, seed, n_updates, str(folder / f"seed_{seed}"), 20, 1, {**QUICK, **overrides}) for seed in range(n)
+    ]
+
+
+def batched(folder: Path, **kwargs: Any) -> BatchedRuns:
+    return BatchedRuns(specs(folder, **kwargs), CPU, "eager", Console(quiet=True))
+
+
+def test_runs_write_what_single_runs_write(tmp_path: Path) -> None:
+    together = batched(tmp_path / "together").run()
+    alone = train_population(specs(tmp_path / "alone", n=1), device="cpu")
+    names = {path.name for path in (tmp_path / "together" / "seed_0").iterdir()}
+    assert names == {path.name for path in (tmp_path / "alone" / "seed_0").iterdir()}
+    assert [path.name for path in sorted((tmp_path / "together").iterdir())] == ["seed_0", "seed_1"]
+    assert together[0].keys() == alone[0].keys()
+    assert [result["evaluated_at"] for result in together] == [40, 40]
+    model = OfflineDCE.load(tmp_path / "together" / "seed_1" / "model.zip")
+    assert (model.num_timesteps, model._n_updates, model.seed) == (40, 40, 1)
+    assert batched(tmp_path / "together").run() == together  # complete: nothing is done again
+
+
+def test_own_randomness_makes_the_members_of_single_runs(tmp_path: Path) -> None:
+    train_population(specs(tmp_path / "alone", execution="eager"), device="cpu", workers=2)
+    runs = BatchedRuns(specs(tmp_path / "together"), CPU, "eager", Console(quiet=True), own_randomness=True)
+    runs.run()
+    for seed in range(2):
+        one, other = (OfflineDCE.load(tmp_path / kind / f"seed_{seed}" / "model.zip") for kind in ("alone", "together"))
+        # float32: the batched products round differently
+        assert largest_difference(all_tensors(one), all_tensors(other)) < 1e-4
+
+
+def test_killed_population_goes_on_to_the_same_members(tmp_path: Path) -> None:
+    folder = tmp_path / "killed"
+    code = (
+        "import sys; from pathlib import Path; sys.path.insert(0, sys.argv[2])\n"
+        "from test_population_runs import batched\n"
+        "batched(Path(sys.argv[1]), n_updates=400).run()"
+    )
+    arguments = [sys.executable, "-c", code, str(folder), str(Path(__file__).parent)]
+    killed = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, start_new_session=True)
+    deadline = time.monotonic() + 200
+    while not (folder / STATE_FILE).exists() and killed.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    os.killpg(killed.pid, 9)
+    killed.wait()
+    assert (folder / STATE_FILE).exists() and not (folder / "seed_0" / "result.json").exists()
+    for kind in ("killed", "whole"):
+        batched(tmp_path / kind, n_updates=400).run()
+    for seed in range(2):
+        one, other = (OfflineDCE.load(tmp_path / kind / f"seed_{seed}" / "model.zip") for kind in ("killed", "whole"))
+        assert largest_difference(all_tensors(one), all_tensors(other)) == 0.0
+        results = [json.loads((tmp_path / k / f"seed_{seed}" / "result.json").read_text()) for k in ("killed", "whole")]
+        assert results[0]["returns"] == results[1]["returns"]
+    assert not (folder / STATE_FILE).exists() and not list(folder.glob("*/checkpoint*"))
+
+
+def test_members_that_diverge_are_named_and_the_others_finish(tmp_path: Path) -> None:
+    members = specs(tmp_path)
+    members[1].overrides["learning_rate"] = 1e30
+    with pytest.raises(DivergenceError, match=r"1 of 2 members diverged: dce seed 1.*the others are complete"):
+        BatchedRuns(members, CPU, "eager", Console(quiet=True)).run()
+    assert (tmp_path / "seed_0" / "result.json").exists() and not (tmp_path / "seed_1" / "result.json").exists()
+
+
+def test_runs_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
+    one, other = specs(tmp_path / "a", n=1), specs(tmp_path / "b", n=1)
+    with pytest.raises(ConfigError, match="common folder"):
+        BatchedRuns([*one, *other], CPU, "eager", Console(quiet=True))
+    longer = specs(tmp_path / "a", n=2, n_updates=60)[1:]
+    with pytest.raises(ConfigError, match=r"share n_updates, got \[40, 60\]"):
+        BatchedRuns([*one, *longer], CPU, "eager", Console(quiet=True))
+
+
+def test_memory_is_said_before_it_starts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    BatchedRuns(specs(tmp_path, n_updates=20), CPU, "eager", Console(width=200)).run()
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.startswith("2 models of dce on cpu: data ") and "networks" in first and "MiB" in first
