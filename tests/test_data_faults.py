@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from dataset_files import ACT_DIM, N_ROWS, OBS_DIM, base_arrays, write_plain
 
-from sb3_dce.data import Transitions, resolve
-from sb3_dce.errors import ConfigError, DatasetError, DatasetFormatError, DatasetSemanticsError, DatasetWarning
+from sb3_dce import OfflineBC, OfflineDCE
+from sb3_dce.data import Transitions, file_sha256, load_transitions, resolve
+from sb3_dce.data.hash_record import record_path, write_record
+from sb3_dce.errors import (
+    ConfigError,
+    DatasetError,
+    DatasetFormatError,
+    DatasetIntegrityError,
+    DatasetSemanticsError,
+    DatasetWarning,
+)
 
 Arrays = dict[str, np.ndarray]
 SPEC = replace(resolve("hopper-medium-v2"), id="base-v2", obs_dim=OBS_DIM, act_dim=ACT_DIM, max_episode_steps=40)
@@ -72,12 +85,19 @@ FAULTS: list[tuple[str, Callable[[Arrays], object], type[DatasetError], tuple[st
     ("D-08", shaped("actions", N_ROWS, 3), FORMAT, ("width 3, 2 is wanted",)),
     ("D-09", shaped("next_observations", N_ROWS, 3, 1), FORMAT, ("next_observations has shape (200, 3, 1)",)),
     ("D-10", shaped("next_observations", N_ROWS, 4), FORMAT, ("next_observations has width 4, 3 is wanted",)),
+    ("D-06b", shaped("observations", N_ROWS, 59), FORMAT, ("width 59, 3 is wanted",)),
     ("D-11", shaped("actions", N_ROWS - 1, 2), FORMAT, ("actions 199", "rewards 200")),
     ("D-12", shaped("rewards", N_ROWS - 1), FORMAT, ("rewards 199",)),
     ("D-13", shaped("terminals", N_ROWS - 1), FORMAT, ("terminals 199",)),
     ("D-14", shaped("timeouts", N_ROWS - 1), FORMAT, ("timeouts 199",)),
     ("D-15", shaped("next_observations", N_ROWS - 1, 3), FORMAT, ("next_observations 199",)),
     ("D-15b", shaped("observations", N_ROWS + 1, 3), FORMAT, ("T+1 observations",)),
+    (
+        "D-11 and D-13",
+        lambda a: (shaped("actions", 199, 2)(a), shaped("terminals", 198)(a)),
+        FORMAT,
+        ("actions 199", "terminals 198"),
+    ),
     ("D-16", cast("rewards", "S8"), FORMAT, ("rewards has type |S8",)),
     ("D-18", cast("observations", "c8"), FORMAT, ("observations has type complex64",)),
     ("D-19", compound, FORMAT, ("rewards", "('value', 'weight')")),
@@ -159,6 +179,11 @@ def long_episode(arrays: Arrays) -> None:
     del arrays["next_observations"]  # they would show the end
 
 
+def open_end(arrays: Arrays) -> None:
+    arrays["timeouts"][199] = False
+    del arrays["next_observations"]
+
+
 ODDITIES: list[tuple[str, Callable[[Arrays], object], str, str]] = [
     ("D-20", cast("observations", "i8"), "warnings", "cast to float32"),
     (
@@ -173,6 +198,7 @@ ODDITIES: list[tuple[str, Callable[[Arrays], object], str, str]] = [
     ("D-42b", inverted, "warnings", "do the flags mean 'not done'?"),
     ("D-43", put("timeouts", 79, True), "warnings", "1 rows are terminal and timeout at once: the terminal wins"),
     ("D-44", put("timeouts", 199, False), "notes", "the last episode is open: 0 rows dropped"),
+    ("D-44b", open_end, "notes", "the last episode is open: 1 rows dropped"),
     ("D-45b", one_unmarked_jump, "notes", "1 unmarked jumps"),
     ("D-46", duplicated, "warnings", "20% of the rows are duplicates"),
     ("D-47", shaped("rewards", N_ROWS), "warnings", "the reward is constant, 0"),
@@ -279,3 +305,114 @@ def test_d4rl_compat_without_flags_asks_for_the_time_limit() -> None:
         Transitions.from_arrays(**arrays, d4rl_compat=True)
     with pytest.raises(ConfigError, match=r"max_episode_steps.*at least 1"):
         Transitions.from_arrays(**arrays, max_episode_steps=0)
+
+
+# -- rules for all of them -----------------------------------------------------------------------------------------
+
+
+def test_one_error_names_all_bad_keys() -> None:
+    arrays = base_arrays()
+    arrays["observations"][3, 1] = arrays["rewards"][4] = arrays["next_observations"][5, 0] = np.nan
+    with pytest.raises(
+        DatasetSemanticsError, match=r"observations has 1 .*rewards has 1 .*next_observations has 1 "
+    ) as caught:
+        Transitions.from_arrays(**arrays)
+    assert (caught.value.key, caught.value.index, caught.value.count) == ("observations", (3, 1), 3)
+    arrays = base_arrays() | {"rewards": np.zeros(N_ROWS, dtype="S1"), "actions": np.zeros((N_ROWS, 2), dtype="c8")}
+    with pytest.raises(DatasetFormatError, match="actions has type complex64; rewards has type"):
+        Transitions.from_arrays(**arrays)
+
+
+def test_widths_of_both_kinds_of_observations_must_agree_without_a_catalogue() -> None:
+    arrays = base_arrays() | {"next_observations": np.zeros((N_ROWS, 4), dtype=np.float32)}
+    with pytest.raises(DatasetFormatError, match=r"\(200, 4\).*\(200, 3\)"):  # D-10
+        Transitions.from_arrays(**arrays)
+
+
+def test_vector_of_actions_is_one_entry_wide() -> None:
+    arrays = base_arrays()
+    arrays["actions"] = arrays["actions"][:, 0]
+    transitions = Transitions.from_arrays(**arrays, act_dim=1)  # D-07
+    assert transitions.act_dim == 1 and np.array_equal(transitions.actions[:, 0], arrays["actions"])
+
+
+@pytest.mark.parametrize("start", [0, 1, 6, 20], ids=lambda start: f"from row {start}")
+def test_shift_is_found_wherever_the_file_begins(start: int) -> None:
+    arrays = base_arrays()
+    for steps in (1, -1):  # D-45 in both directions
+        shifted = arrays | {"next_observations": np.roll(arrays["next_observations"], -steps, axis=0)}
+        with pytest.raises(DatasetSemanticsError, match=re.escape(f"a shift of {steps:+d} rows")):
+            Transitions.from_arrays(**{key: array[start:] for key, array in shifted.items()})
+
+
+def as_file(path: Path) -> Path:
+    """The base arrays in the format of the suffix."""
+    arrays = base_arrays()
+    if path.suffix == ".hdf5":
+        return write_plain(path, arrays)
+    if path.suffix == ".npz":
+        np.savez(path, **arrays)
+        return path
+    columns = {}
+    for key, array in arrays.items():
+        columns |= {f"{key}_{i}": array[:, i] for i in range(array.shape[1])} if array.ndim == 2 else {key: array}
+    frame = pd.DataFrame(columns)
+    frame.to_csv(path) if path.suffix == ".csv" else frame.to_parquet(path)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".hdf5", ".npz", ".csv", ".parquet"])
+def test_reading_changes_no_file_and_leaves_none(suffix: str, tmp_path: Path) -> None:
+    if suffix == ".parquet":
+        pytest.importorskip("pyarrow")
+    path = as_file(tmp_path / f"mine{suffix}")
+    path.chmod(0o444)
+    before, status = path.read_bytes(), path.stat()
+    load_transitions(path)
+    with pytest.raises(DatasetFormatError):
+        load_transitions(path, obs_dim=99)
+    assert path.read_bytes() == before and path.stat().st_mtime_ns == status.st_mtime_ns
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("keep", [0.1, 0.5, -1], ids=["D-58", "D-59", "D-60"])
+@pytest.mark.parametrize("suffix", [".hdf5", ".npz", ".parquet"])
+def test_truncated_file_is_refused_and_a_known_hash_is_named(suffix: str, keep: float, tmp_path: Path) -> None:
+    if suffix == ".parquet":
+        pytest.importorskip("pyarrow")
+    path = as_file(tmp_path / f"mine{suffix}")
+    content, expected = path.read_bytes(), file_sha256(path)
+    write_record(path, expected, "https://example.org/mine")
+    path.write_bytes(content[:-1] if keep < 0 else content[: int(keep * len(content))])
+    if suffix == ".hdf5":  # the format of downloads
+        with pytest.raises(DatasetIntegrityError, match=f"changed since .*{file_sha256(path)}, expected {expected}"):
+            load_transitions(path)
+    record_path(path).unlink()
+    with pytest.raises(DatasetIntegrityError):
+        load_transitions(path)
+
+
+def test_refused_data_leave_the_model_as_it_was(arrays: Arrays, transitions: Transitions, tmp_path: Path) -> None:
+    model = OfflineBC("MlpPolicy", dataset=transitions, seed=0)
+    model.learn(2)
+    weights = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    bad = write_plain(tmp_path / "bad.hdf5", arrays | {"rewards": np.full(len(arrays["rewards"]), np.nan)})
+    model.set_dataset(bad)
+    with pytest.raises(DatasetSemanticsError, match="NaN"):
+        model.learn(2)
+    assert all(value.equal(weights[name]) for name, value in model.policy.state_dict().items())
+
+
+def test_reward_normalization_needs_returns_that_differ(arrays: Arrays) -> None:
+    constant = Transitions.from_arrays(**(arrays | {"rewards": np.zeros(len(arrays["rewards"]), dtype=np.float32)}))
+    model = OfflineDCE("MlpPolicy", dataset=constant, reward_normalization="iql")
+    with pytest.raises(DatasetSemanticsError, match="return range is 0"):  # D-47
+        model.learn(1)
+
+
+def test_command_line_tells_faults_without_a_traceback(tmp_path: Path) -> None:
+    path = write_plain(tmp_path / "bad.hdf5", base_arrays() | {"rewards": np.full(N_ROWS, np.nan, dtype=np.float32)})
+    code = "import sys; from sb3_dce.cli import main; sys.argv = ['sb3-dce', 'datasets', 'info', sys.argv[1]]; main()"
+    done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2 and done.stdout == "" and "Traceback" not in done.stderr
+    assert "rewards has 200 NaN" in done.stderr and "drop_nonfinite=True" in done.stderr

@@ -54,6 +54,8 @@ def arrays_from_npz(path: str | PathLike[str], *, max_bytes: int = DEFAULT_MAX_B
         _check_directory(file, path)
         with _zip_errors(path), zipfile.ZipFile(file) as archive:
             members = _select(archive.infolist(), path, max_bytes)
+            for info in archive.infolist():  # a damaged name would pass for an array that is not there
+                archive.open(info).close()
             return {key: _read_member(archive, member, key, path) for key, member in members.items()}
 
 
