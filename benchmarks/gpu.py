@@ -1,0 +1,121 @@
+"""
+Updates per second on a CUDA device: one model in every way of running it, and populations of 5, 20 and 60.
+
+    python benchmarks/gpu.py            # one table in under ten minutes
+
+Data are random numbers of HalfCheetah's shape: speed only, no statement about returns. Writes ``results/gpu.json`` and
+``results/gpu.md`` beside this file and prints the latter.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from loading import ACT_DIM, OBS_DIM, RESULTS, machine, make_arrays
+from stable_baselines3 import SAC
+from stable_baselines3.common.logger import Logger
+
+from sb3_dce import OfflineDCE, Transitions
+from sb3_dce.envs import SpacesEnv
+from sb3_dce.population import Population
+
+BATCH = 256
+
+
+def updates_per_second(train: Callable[[int], None], seconds: float) -> list[float]:
+    """
+    :param train: runs so many updates
+    :param seconds: about how long each of three repeats lasts
+    :return: updates per second of each
+    """
+    train(30)  # compiling, capturing, tuning
+    th.cuda.synchronize()
+    started = time.perf_counter()
+    train(30)
+    th.cuda.synchronize()
+    n = max(30, round(30 * seconds / (time.perf_counter() - started)))
+    rates = []
+    for _ in range(3):
+        started = time.perf_counter()
+        train(n)
+        th.cuda.synchronize()
+        rates.append(n / (time.perf_counter() - started))
+    return rates
+
+
+def main() -> None:
+    """Measure, write, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rows", type=int, default=1_000_000)
+    parser.add_argument("--seconds", type=float, default=4.0)
+    parser.add_argument("--members", default="5,20,60")
+    parser.add_argument("--device", default="cuda", help="only to try the script: 'cpu' says nothing")
+    parser.add_argument("--out", type=Path, default=RESULTS / "gpu")
+    options = parser.parse_args()
+    if options.device == "cuda" and not th.cuda.is_available():
+        sys.exit("This measures a CUDA device, and PyTorch finds none.")
+    if options.device == "cpu":
+        th.cuda.synchronize = lambda: None  # type: ignore[assignment]
+
+    transitions = Transitions.from_arrays(**make_arrays(options.rows))
+    env = SpacesEnv(spaces.Box(-np.inf, np.inf, (OBS_DIM,), np.float64), spaces.Box(-1, 1, (ACT_DIM,), np.float32))
+    common: dict[str, Any] = {"env": env, "dataset": transitions, "batch_size": BATCH, "seed": 0}
+    results: dict[str, list[float]] = {}
+
+    def measured(name: str, train: Callable[[int], None]) -> None:
+        results[name] = updates_per_second(train, options.seconds)
+        print(f"  {name}: {max(results[name]):,.0f} updates/s", flush=True)
+
+    sac = SAC("MlpPolicy", env, buffer_size=len(transitions), batch_size=BATCH, seed=0, device=options.device)
+    for name in ("observations", "next_observations", "actions"):
+        getattr(sac.replay_buffer, name)[:, 0] = getattr(transitions, name)
+    sac.replay_buffer.full = True
+    sac.set_logger(Logger(None, []))
+    measured("SAC.train of Stable-Baselines3", lambda n: sac.train(n, BATCH))
+    for precision in ("float32", "tf32"):
+        for execution in ("eager", "compile", "cudagraph") if precision == "float32" else ("cudagraph",):
+            model = OfflineDCE("MlpPolicy", execution=execution, precision=precision, device=options.device, **common)
+            measured(f"DCE, {execution}, {precision}", lambda n, model=model: model.train(n, BATCH))
+        for k in map(int, options.members.split(",")):
+            members = [
+                OfflineDCE("MlpPolicy", precision=precision, device="cpu", **{**common, "seed": seed}) for seed in range(k)
+            ]
+            population = Population(members, options.device, "cudagraph")
+            measured(f"{k} x DCE, cudagraph, {precision}", lambda n, p=population: p.train(n))
+            results[f"{k} x DCE, cudagraph, {precision}"] = [
+                k * rate for rate in results[f"{k} x DCE, cudagraph, {precision}"]
+            ]
+            del population, members
+
+    device = th.cuda.get_device_name() if options.device == "cuda" else "cpu"
+    facts = {**machine(), "device": device, "date": time.strftime("%Y-%m-%d"), "rows": options.rows}
+    lines = [
+        f"# Updates per second on {device}",
+        "",
+        f"PyTorch {facts['torch']}, {facts['date']}; batch {BATCH}, 256-256 networks, random numbers of HalfCheetah's shape. "
+        "Best of three repeats; a population counts the updates of all members.",
+        "",
+        "| | member-updates/s | least - most |",
+        "|---|---|---|",
+        *(f"| {name} | {max(rates):,.0f} | {min(rates):,.0f} - {max(rates):,.0f} |" for name, rates in results.items()),
+    ]
+    text = "\n".join(lines) + "\n"
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.with_suffix(".json").write_text(
+        json.dumps({"facts": facts, "rates": results}, indent=1) + "\n", encoding="utf-8"
+    )
+    options.out.with_suffix(".md").write_text(text, encoding="utf-8")
+    print(text)
+
+
+if __name__ == "__main__":
+    main()
