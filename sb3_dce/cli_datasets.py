@@ -109,6 +109,7 @@ def check_dataset(
         typer.echo(json.dumps(examination.as_dict(), indent=2))
     else:
         _print_checks(examination.checks)
+        console.print(f"verdict: {examination.verdict}")
     if examination.error is not None:
         raise examination.error
     raise typer.Exit(EXIT_CODES[examination.verdict])

@@ -240,8 +240,14 @@ def test_survival_remedy_is_a_beta_that_passes() -> None:
     remedy = survival(1.5, 10, Penalty(4.0, 1.0, "a test")).remedy
     assert remedy is not None
     beta = float(remedy.split("below ")[1].split(",")[0])
-    assert beta == pytest.approx(2 * 0.8 * 1.5)
+    assert beta == pytest.approx(2 * 0.8 * 1.5)  # where the note about a narrow margin begins
     assert survival(1.5, 10, Penalty(beta, 1.0, "a test")).verdict == "ok"
+
+
+def test_survival_remedy_where_living_costs_is_a_shift_that_passes() -> None:
+    remedy = survival(-0.5, 10, Penalty(4.0, 1.0, "a test")).remedy
+    assert remedy is not None and "more than 2.5 per step with reward_shift" in remedy
+    assert survival(-0.5 + 2.6, 10, Penalty(4.0, 1.0, "a test")).verdict != "warning"
 
 
 def test_penalty_comes_from_the_row_or_from_the_user() -> None:
@@ -273,7 +279,7 @@ def test_embedded_data_have_no_warnings(dataset_id: str) -> None:
 def test_command_prints_a_line_per_check_and_returns_0_for_notes() -> None:
     outcome = run_datasets("check", "halfcheetah-tiny-sb3")
     assert outcome.code == 0 and outcome.stderr == ""
-    for word in ("ok", "note", "finite values", "survival condition", "remedy: "):
+    for word in ("ok", "note", "finite values", "survival condition", "remedy: ", "verdict: note"):
         assert word in outcome.stdout
 
 

@@ -243,7 +243,7 @@ def survival(reward_mean: float, n_terminals: int, penalty: Penalty) -> Check:
     if shift <= NARROW_MARGIN * reward_mean:
         return Check(name, "ok", f"{asked}, is below the mean reward per step, {reward}")
     if reward_mean <= 0:
-        remedy = f"Living costs even with beta = 0: add more than {-reward_mean:.3g} per step with reward_shift"
+        remedy = f"Living does not pay even with beta = 0: add more than {shift - reward_mean:.3g} per step with reward_shift"
     else:
         remedy = f"Keep beta below {2 * penalty.td_loss_coef * NARROW_MARGIN * reward_mean:.3g}, or raise reward_scale"
     if shift <= reward_mean:

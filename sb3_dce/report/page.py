@@ -196,8 +196,11 @@ def _attributes(path: Path | None) -> Mapping[str, str]:
     """Attributes of the root of an HDF5 file as short texts."""
     if path is None or not path.is_file() or path.suffix.lower() in (".npz", ".csv", ".parquet"):
         return {}
-    with D4RLFile(path) as file:
-        found = file.attributes()
+    try:
+        with D4RLFile(path) as file:
+            found = file.attributes()
+    except DatasetError:  # a file of another layout, such as Minari's, whose groups can be many
+        return {}
     texts = {}
     for name, value in list(found.items())[:MAX_ATTRIBUTES]:
         text = value.decode("utf-8", errors="replace") if isinstance(value, bytes) else str(value)

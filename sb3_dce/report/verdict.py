@@ -92,7 +92,7 @@ def _beta(transitions: Transitions, penalty: Penalty) -> tuple[str, str]:
     if reward <= 0:
         return "beta", (
             f"{ends} and the mean reward per step is {reward:.3g}: living does not pay, so every beta above 0 makes the "
-            f"end of an episode attractive. Add more than {-reward:.3g} per step with reward_shift."
+            f"end of an episode attractive. {planned}: add more than {penalty.shift - reward:.3g} per step with reward_shift."
         )
     low, high = (share * factor * reward for share in REWARD_BUDGET)
     if penalty.shift > reward:
