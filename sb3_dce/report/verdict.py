@@ -184,7 +184,7 @@ def _behaviour(behaviour: Behaviour | None) -> tuple[str, str]:
     elif std < NEARLY_UNIFORM:
         kind = "Noisy: cloning by likelihood suits, with a deviation that is learnt"
     else:
-        kind = "Close to random actions: the mean action says little, cloning will be weak"
+        kind = "Close to random actions, or several policies at once: the mean action says little, cloning will be weak"
     return "behaviour", f"{kind}; {given}; {mixing}."
 
 
