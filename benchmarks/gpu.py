@@ -90,10 +90,9 @@ def main() -> None:
                 OfflineDCE("MlpPolicy", precision=precision, device="cpu", **{**common, "seed": seed}) for seed in range(k)
             ]
             population = Population(members, options.device, "cudagraph")
-            measured(f"{k} x DCE, cudagraph, {precision}", lambda n, p=population: p.train(n))
-            results[f"{k} x DCE, cudagraph, {precision}"] = [
-                k * rate for rate in results[f"{k} x DCE, cudagraph, {precision}"]
-            ]
+            name = f"{k} x DCE, cudagraph, {precision}"
+            measured(name, lambda n, p=population: p.train(n))
+            results[name] = [k * rate for rate in results[name]]
             del population, members
 
     device = th.cuda.get_device_name() if options.device == "cuda" else "cpu"
@@ -110,9 +109,8 @@ def main() -> None:
     ]
     text = "\n".join(lines) + "\n"
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.with_suffix(".json").write_text(
-        json.dumps({"facts": facts, "rates": results}, indent=1) + "\n", encoding="utf-8"
-    )
+    document = json.dumps({"facts": facts, "rates": results}, indent=1)
+    options.out.with_suffix(".json").write_text(document + "\n", encoding="utf-8")
     options.out.with_suffix(".md").write_text(text, encoding="utf-8")
     print(text)
 

@@ -360,3 +360,17 @@ def test_loading_needs_little_more_memory_than_the_rows(tmp_path: Path) -> None:
     }
     large, small = write_plain(tmp_path / "large.hdf5", arrays), write_plain(tmp_path / "small.hdf5", base_arrays())
     subprocess.run([sys.executable, "-W", "error", "-c", MEASURE, str(large), str(n_rows), str(small)], check=True, timeout=60)
+
+
+@pytest.mark.parametrize("options", [{}, {"d4rl_compat": True}])
+def test_episode_whose_last_row_is_left_out_ends_one_row_earlier(options: dict[str, Any], tmp_path: Path) -> None:
+    """Otherwise a file of the transitions would know no ends, and a reader would find jumps."""
+    timeouts = np.array([0, 0, 1, 0, 1, 0, 0], dtype=bool)  # the last episode is open
+    obs = np.arange(7.0)[:, None]
+    data = Transitions.from_arrays(obs, np.zeros((7, 1)), np.arange(7.0), np.zeros(7, bool), timeouts, **options)
+    assert data.observations[:, 0].tolist() == [0, 1, 3, 5]
+    assert data.timeouts.tolist() == [False, True, True, False]
+    data.to_hdf5(tmp_path / "again.hdf5")
+    again = Transitions.from_hdf5(tmp_path / "again.hdf5")
+    assert np.array_equal(again.rows, data.rows) and np.array_equal(again.timeouts, data.timeouts)
+    assert again.info.episode_lengths.tolist() == [2, 1] and not any("jumps" in note for note in again.info.notes)

@@ -150,7 +150,15 @@ def build_rows(
         notes=tuple(findings.notes),
         warnings=tuple(findings.warnings),
     )
-    return BuiltRows(rows, layout, episodes.timeouts[used], episodes.index[used], info)
+    return BuiltRows(rows, layout, _ends_of_used(episodes, used), episodes.index[used], info)
+
+
+def _ends_of_used(episodes: Episodes, used: np.ndarray) -> np.ndarray:
+    """Timeouts of the used rows: where the row at the limit is left out, its episode ends one row earlier."""
+    ends = episodes.timeouts.copy()
+    left_out = np.flatnonzero(ends[1:] & ~used[1:] & (episodes.index[1:] == episodes.index[:-1])) + 1
+    ends[left_out - 1] = True
+    return ends[used]
 
 
 def _allocate(n_rows: int, width: int, where: str) -> np.ndarray:
