@@ -201,7 +201,9 @@ def test_flags_of_all_kinds(root: Path) -> None:
 
 
 def test_d4rl_compat_drops_what_d4rl_drops(root: Path) -> None:
-    path = dataset(root, episode(3), episode(3, end="terminations"), episode(3))
+    both = episode(3, end="terminations")
+    both["truncations"][-1] = True  # a terminal, which D4RL keeps
+    path = dataset(root, episode(3), both, episode(3))
     assert len(load_transitions(path, d4rl_compat=True)) == 9 - 2 and len(load_transitions(path)) == 9
 
 
