@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pandas as pd
 import pytest
@@ -14,7 +15,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 import sb3_dce
 from sb3_dce import OfflineBC, Transitions, load_dataset
 from sb3_dce.envs import SpacesEnv
-from sb3_dce.errors import ConfigError, DatasetSemanticsError
+from sb3_dce.errors import ConfigError, DatasetFormatError, DatasetSemanticsError
 
 
 def as_frame(arrays: dict[str, np.ndarray]) -> pd.DataFrame:
@@ -105,6 +106,23 @@ def test_other_action_scales_are_refused(value: object) -> None:
 def test_two_rules_for_the_actions_are_one_too_many() -> None:
     with pytest.raises(ConfigError, match="twice"):
         Transitions.from_arrays(**base_arrays(), action_scale=2.0, action_low=-2.0)
+
+
+def test_bounds_of_the_actions_travel_with_the_file(tmp_path: Path) -> None:
+    arrays = base_arrays()
+    arrays["actions"] = arrays["actions"] * [50, 1]
+    data = Transitions.from_arrays(**arrays, action_low=[-50, -1], action_high=[50, 1])
+    data.to_hdf5(tmp_path / "mine.hdf5")
+    again = load_dataset(tmp_path / "mine.hdf5")
+    assert np.array_equal(again.rows, data.rows)
+    assert np.array_equal(again.info.action_space_high, [50, 1])
+    assert load_dataset(tmp_path / "mine.hdf5", action_scale=60).info.action_space_high.tolist() == [60, 60]
+    Transitions.from_arrays(**base_arrays()).to_hdf5(tmp_path / "usual.hdf5")
+    with h5py.File(tmp_path / "usual.hdf5", "a") as file:
+        assert "action_bounds" not in file.attrs
+        file.attrs["action_bounds"] = "[1, 2]"
+    with pytest.raises(DatasetFormatError, match="action_bounds"):
+        load_dataset(tmp_path / "usual.hdf5")
 
 
 def test_an_agent_acts_in_the_units_of_the_data(tmp_path: Path) -> None:

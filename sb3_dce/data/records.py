@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,10 @@ import numpy as np
 
 from sb3_dce.data.hashes import file_sha256
 from sb3_dce.data.hdf5 import DEFAULT_MAX_BYTES
-from sb3_dce.errors import ConfigError, DatasetIntegrityError
+from sb3_dce.errors import ConfigError, DatasetFormatError, DatasetIntegrityError
+
+# Root attribute with the bounds of actions that are not in [-1, 1], JSON.
+BOUNDS_ATTRIBUTE = "action_bounds"
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,29 @@ class ReadOptions:
                 key="action_scale",
                 hint="100.0 means actions in [-100, 100]",
             )
+
+    def with_bounds_of(self, attribute: Any, where: str) -> ReadOptions:
+        """
+        Take the bounds of the actions from a file, unless they were given.
+
+        :param attribute: as made by :func:`bounds_attribute`; None if the file has none
+        :param where: file, for messages
+        :return: options with bounds
+        :raises DatasetFormatError: if the attribute is something else
+        """
+        if attribute is None or not (self.action_low is self.action_high is self.action_scale is None):
+            return self
+        try:
+            bounds = json.loads(attribute)
+            low, high = (np.asarray(bounds[name], dtype=np.float32) for name in ("low", "high"))
+        except (TypeError, ValueError, KeyError) as error:
+            raise DatasetFormatError(
+                f"the attribute {BOUNDS_ATTRIBUTE} is no JSON with the lists 'low' and 'high'",
+                where=where,
+                hint="Give the bounds as action_low= and action_high=",
+                key=BOUNDS_ATTRIBUTE,
+            ) from error
+        return replace(self, action_low=low, action_high=high)
 
     def action_bounds(
         self, act_dim: int, lowest: np.ndarray | None = None, highest: np.ndarray | None = None
@@ -206,3 +233,14 @@ def file_state(path: Path) -> tuple[int, int]:
     """
     status = os.stat(path)
     return status.st_size, status.st_mtime_ns
+
+
+def bounds_attribute(low: np.ndarray, high: np.ndarray) -> dict[str, str]:
+    """
+    :param low: smallest allowed action, shape (act_dim,)
+    :param high: largest allowed action, shape (act_dim,)
+    :return: root attribute of a file with such actions; empty for [-1, 1], which needs none
+    """
+    if (low == -1.0).all() and (high == 1.0).all():
+        return {}
+    return {BOUNDS_ATTRIBUTE: json.dumps({"low": low.tolist(), "high": high.tolist()})}

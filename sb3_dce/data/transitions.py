@@ -19,7 +19,7 @@ from sb3_dce.data.layout import CORE_KEYS, ArraySource, RowLayout
 from sb3_dce.data.minari import METADATA_FILE, Flatten, action_bounds, find_minari, reward_note
 from sb3_dce.data.minari_episodes import open_episodes
 from sb3_dce.data.npz import arrays_from_npz, npz_keys, write_npz
-from sb3_dce.data.records import DatasetInfo, ReadOptions
+from sb3_dce.data.records import BOUNDS_ATTRIBUTE, DatasetInfo, ReadOptions, bounds_attribute
 from sb3_dce.data.row_cache import cached_rows
 from sb3_dce.data.sb3_buffer import arrays_from_replay_buffer
 from sb3_dce.data.tables import Columns, arrays_from_csv, arrays_from_dataframe, arrays_from_parquet
@@ -352,7 +352,7 @@ class Transitions:
     def to_hdf5(self, path: str | PathLike[str]) -> None:
         """
         Write these transitions in D4RL's layout, next observations included. :meth:`from_hdf5` reads the same rows again, bit
-        for bit, if it is given the same bounds of the actions.
+        for bit; other bounds of the actions than [-1, 1] are an attribute of the file.
 
         :param path: file to write; an existing one is replaced when the new one is complete
         :raises CheckpointError: if it cannot be written
@@ -371,7 +371,9 @@ class Transitions:
     def _exported(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Arrays in D4RL's layout, and attributes. ``generated`` keeps a copy from passing for an official file."""
         arrays = {key: getattr(self, key) for key in CORE_KEYS} | {"terminals": self.terminals.astype(bool)}
-        return arrays, {"dataset_id": self.info.id, "generated": True, "content_hash": content_hash(arrays)}
+        info = self.info
+        attributes = {"dataset_id": info.id, "generated": True, "content_hash": content_hash(arrays)}
+        return arrays, {**attributes, **bounds_attribute(info.action_space_low, info.action_space_high)}
 
     def summary(self) -> list[str]:
         """
@@ -417,6 +419,7 @@ def _rows_of_hdf5(path: Path, spec: DatasetSpec | None, options: ReadOptions) ->
                 where=str(path),
                 hint="Give it its own name, such ids end in -sb3",
             )
+        options = options.with_bounds_of(file.attributes().get(BOUNDS_ATTRIBUTE), str(path))
         dataset_id, sources = spec.id if spec else path.stem, file.select(CORE_KEYS)
         return build_rows(sources, dataset_id=dataset_id, path=path, found_keys=file.keys, spec=spec, options=options)
 

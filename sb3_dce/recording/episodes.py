@@ -99,6 +99,7 @@ class EpisodeRunner:
         self.policy = policy
         self.env, limit = _without_bookkeeping(wrapped)
         self.limit = _limit(spec, limit)
+        self.action_space = action_space
         self._low, self._high = action_space.low, action_space.high
         self._dtype = action_space.dtype
         half_range = (self._high.astype(np.float64) - self._low) / 2

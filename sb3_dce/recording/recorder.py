@@ -26,6 +26,7 @@ import sb3_dce
 from sb3_dce.data.catalog import DatasetSpec, normalized_score, resolve, spec_of_file
 from sb3_dce.data.hashes import content_hash
 from sb3_dce.data.hdf5 import write_hdf5
+from sb3_dce.data.records import bounds_attribute
 from sb3_dce.errors import CheckpointError, ConfigError, DatasetError, SB3DCEError
 from sb3_dce.numpy_policy import NumpyPolicy
 from sb3_dce.recording.episodes import Arrays, EpisodeRunner, RecordingSpec, dataset_of_env
@@ -122,7 +123,8 @@ def record(
                 parts.add(arrays, len(lengths))
         progress(total, total)
         arrays = parts.rows(n_rows) if n_rows is not None else parts.first_episodes(total)
-        attrs = {**describe(name, spec.env, arrays), **_origin(spec, runner), **(extra or {})}
+        bounds = bounds_attribute(runner.action_space.low.reshape(-1), runner.action_space.high.reshape(-1))
+        attrs = {**describe(name, spec.env, arrays), **bounds, **_origin(spec, runner), **(extra or {})}
         write_hdf5(out, arrays, attrs)
     except BaseException:
         parts.flush()  # nothing is lost by Ctrl-C
