@@ -202,9 +202,9 @@ def test_buffer_of_another_environment_is_refused(tmp_path: Path) -> None:
 # -- training of what is missing -----------------------------------------------------------------------------------------
 
 
-def sac_run(folder: Path, target: float, max_steps: int = 180, **changes: Any) -> SACRun:
+def sac_run(folder: Path, target: float, max_steps: int = 180, task: str = "hopper", **changes: Any) -> SACRun:
     settings = SACSettings(max_steps=max_steps, **{**TINY_SAC, **changes.pop("settings", {})})
-    return SACRun("hopper-medium-sb3", target, 0, folder, settings, **changes)
+    return SACRun(f"{task}-medium-sb3", target, 0, folder, settings, **changes)
 
 
 def test_missing_medium_and_replay_are_stages_of_one_run(tmp_path: Path) -> None:
@@ -237,6 +237,12 @@ def test_replay_is_the_buffer_with_true_terminals_and_timeouts(tmp_path: Path) -
     assert rows["terminals"].sum() >= 2 and not rows["timeouts"].any()
     inner = ~rows["terminals"][:-1]
     assert np.allclose(buffer.next_observations[:119, 0][inner], rows["observations"][1:][inner], atol=1e-5)
+
+
+def test_time_limit_in_the_replay_is_a_timeout(tmp_path: Path) -> None:
+    settings = {"eval_freq": 1010, "learning_starts": 2000}
+    rows = sac_run(tmp_path, ANY_RETURN, 1010, task="halfcheetah", settings=settings).replay()
+    assert np.flatnonzero(rows["timeouts"]).tolist() == [999] and not rows["terminals"].any()
 
 
 def test_target_out_of_reach_is_said_with_the_best_return(tmp_path: Path) -> None:
