@@ -272,8 +272,10 @@ class Interrupt:
 
 
 def test_interrupted_training_goes_on_from_its_last_evaluation(tmp_path: Path) -> None:
+    stopped = sac_run(tmp_path, NO_RETURN, progress=Interrupt(100))
     with pytest.raises(KeyboardInterrupt):
-        sac_run(tmp_path, NO_RETURN, progress=Interrupt(100)).expert()
+        stopped.expert()
+    assert stopped._loaded_model().num_timesteps == 60
     resumed = sac_run(tmp_path, NO_RETURN)
     assert resumed.steps == 60
     before = resumed._rows()

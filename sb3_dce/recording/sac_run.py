@@ -156,7 +156,12 @@ class SACRun:
         model = self._loaded_model()
         before = self.steps
         until = min(before + self.settings.eval_freq, self.settings.max_steps)
-        model.learn(until - before, callback=_ReportSteps(self.progress, self.settings.max_steps), reset_num_timesteps=False)
+        reporting = _ReportSteps(self.progress, self.settings.max_steps)
+        try:
+            model.learn(until - before, callback=reporting, reset_num_timesteps=False)
+        except BaseException:
+            self._model = None  # it is ahead of the checkpoint
+            raise
         returns = self._evaluate(model)
         self._state["steps"] = until
         self._state["evaluations"].append([until, float(returns.mean()), float(returns.std())])
