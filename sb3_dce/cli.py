@@ -1,4 +1,4 @@
-"""The command line: ``sb3-dce demo | train | evaluate | datasets``."""
+"""The command line: ``sb3-dce demo | train | compare | evaluate | datasets``."""
 
 from __future__ import annotations
 
@@ -75,6 +75,30 @@ def train(
         overrides=_parse_overrides(set_ or []),
         console=console,
     )
+
+
+@app.command()
+def compare(
+    dataset: Annotated[str, typer.Option(help="Id such as [b]walker2d-medium[/b], or a file.")],
+    algos: Annotated[str, typer.Option(help="Agents, separated by commas.")] = "dce,offline_bc",
+    updates: Annotated[float, typer.Option(min=1, help="Gradient steps of each run, e.g. 1e5.")] = 1e6,
+    seeds: Annotated[int, typer.Option(min=1, help="Seeds of each agent.")] = 3,
+    eval_freq: Annotated[int, typer.Option(min=1, help="Gradient steps between two evaluations and checkpoints.")] = 5000,
+    eval_episodes: Annotated[int, typer.Option(min=1, help="Episodes of each evaluation.")] = 10,
+    workers: Annotated[int, typer.Option(min=0, show_default=False, help="Processes; default: one per core.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option(show_default=False, help="Folder of the results; default runs/compare-<dataset>.")
+    ] = None,
+) -> None:
+    """Train several agents on one dataset and compare their last policies. The same command goes on with the rest."""
+    from sb3_dce.data import find_file
+
+    find_file(dataset)  # a missing file is said before PyTorch is imported
+    from sb3_dce.compare import compare as run_comparison
+
+    names = [name.strip() for name in algos.split(",") if name.strip()]
+    n_workers = workers or os.cpu_count() or 1
+    run_comparison(dataset, names, int(updates), range(seeds), eval_freq, eval_episodes, n_workers, out, console)
 
 
 @app.command()

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_dce.checks import check_number
 from sb3_dce.data.catalog import normalized_score, resolve
-from sb3_dce.envs import make_env_if_possible, missing_simulator
+from sb3_dce.data.minari import is_minari_name
+from sb3_dce.envs import make_env_if_possible, make_minari_env, missing_simulator
 from sb3_dce.errors import DatasetError
 from sb3_dce.files import write_atomically
 from sb3_dce.rollouts import Rollouts, deterministic_act
@@ -82,6 +84,26 @@ def make_rollouts(dataset_id: str, n_episodes: int) -> Rollouts | None:
     if missing_simulator(resolve(dataset_id)) is not None:
         return None
     return Rollouts(lambda: make_env_if_possible(dataset_id), n_episodes)
+
+
+def rollouts_of(dataset: str | None, n_episodes: int) -> Rollouts | None:
+    """
+    :param dataset: id, file or ``minari:`` name a model was trained on
+    :param n_episodes: episodes of an evaluation
+    :return: environments to evaluate in, or ``None`` where none is known or there is no simulator
+    """
+    dataset_id = catalogue_id(dataset)
+    if dataset_id is not None:
+        return make_rollouts(dataset_id, n_episodes)
+    if not is_minari_name(dataset) or make_minari_env(dataset) is None:
+        return None
+
+    def make_env() -> gym.Env:
+        env = make_minari_env(dataset)
+        assert env is not None
+        return env
+
+    return Rollouts(make_env, n_episodes)
 
 
 def evaluate(model: Any, rollouts: Rollouts, seed: int, dataset_id: str | None = None) -> Evaluation:

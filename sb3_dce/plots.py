@@ -8,12 +8,16 @@ import numpy as np
 
 from sb3_dce.evaluation import Evaluation
 
+# 97.5 % quantiles of Student's t by degrees of freedom.
+STUDENT_T = {1: 12.706, 2: 4.303, 3: 3.182, 4: 2.776, 5: 2.571, 6: 2.447, 7: 2.365, 8: 2.306, 9: 2.262, 10: 2.228}
+
 
 def plot_learning_curves(
     curves: dict[str, list[list[Evaluation]]],
     path: Path,
     title: str,
     levels: dict[str, float] | None = None,
+    confidence: bool = False,
 ) -> Path | None:
     """
     Normalised score (or return, without reference scores) against gradient steps: mean over seeds, each seed thin.
@@ -22,6 +26,7 @@ def plot_learning_curves(
     :param path: picture to write
     :param title: heading
     :param levels: horizontal lines in the same units, by name
+    :param confidence: shade the 95 % confidence interval of the mean (Student's t) from three seeds on, instead of the range
     :return: ``path``, or ``None`` without matplotlib or without any evaluation
     """
     if not any(seed for seeds in curves.values() for seed in seeds):
@@ -42,7 +47,8 @@ def plot_learning_curves(
         label = f"{name} (mean of {len(seeds)} seeds)" if len(seeds) > 1 else name
         axes.plot(steps, values.mean(axis=0), color=color, linewidth=2.0, label=label)
         if len(seeds) > 1:
-            axes.fill_between(steps, values.min(axis=0), values.max(axis=0), color=color, alpha=0.15, linewidth=0)
+            low, high = _interval(values) if confidence and len(seeds) > 2 else (values.min(axis=0), values.max(axis=0))
+            axes.fill_between(steps, low, high, color=color, alpha=0.15, linewidth=0)
     for number, (name, level) in enumerate((levels or {}).items()):
         axes.axhline(level, color="0.3", linestyle=("--", ":", "-.")[number % 3], linewidth=1.0, label=name)
     axes.set_xlabel("gradient steps")
@@ -53,6 +59,16 @@ def plot_learning_curves(
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)
     return path
+
+
+def _interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of the 95 % confidence interval of the mean over the first axis."""
+    n = len(values)
+    # From 12 seeds on the expansion of the quantile is exact to 0.01.
+    quantile = STUDENT_T[n - 1] if n - 1 in STUDENT_T else 1.96 + 2.37 / (n - 1) + 2.8 / (n - 1) ** 2
+    half = quantile * values.std(axis=0, ddof=1) / np.sqrt(n)
+    mean = values.mean(axis=0)
+    return mean - half, mean + half
 
 
 def _value(evaluation: Evaluation, scored: bool) -> float:

@@ -27,8 +27,8 @@ from sb3_dce.evaluation import (
     catalogue_id,
     evaluate,
     evaluation_seed,
-    make_rollouts,
     read_evaluations,
+    rollouts_of,
     write_evaluations,
 )
 from sb3_dce.files import write_atomically
@@ -110,7 +110,7 @@ class BatchedRuns:
         for spec, folder in zip(specs, self.folders, strict=True):
             refuse_other_run(spec, folder)
         self._device, self._execution, self._own_randomness = device, execution, own_randomness
-        self._rollouts: dict[str, Rollouts | None] = {}
+        self._rollouts: dict[str | None, Rollouts | None] = {}
         self._diverged: dict[int, int] = {}
         self._loggers: list[Logger] = []
         self._seconds_before = 0.0
@@ -192,14 +192,12 @@ class BatchedRuns:
 
     def _evaluate(self, models: Sequence[OfflineAlgorithm], n_updates: int) -> None:
         for index, (spec, model, folder) in enumerate(zip(self.specs, models, self.folders, strict=True)):
+            if model.dataset not in self._rollouts:
+                self._rollouts[model.dataset] = rollouts_of(model.dataset, spec.n_eval_episodes)
+            rollouts = self._rollouts[model.dataset]
+            if rollouts is None or index in self._diverged:
+                continue
             dataset_id = catalogue_id(model.dataset)
-            if dataset_id is None or index in self._diverged:
-                continue
-            if dataset_id not in self._rollouts:
-                self._rollouts[dataset_id] = make_rollouts(dataset_id, spec.n_eval_episodes)
-            rollouts = self._rollouts[dataset_id]
-            if rollouts is None:
-                continue
             seed = evaluation_seed(spec.seed, n_updates // spec.eval_freq)
             outcome: Evaluation = evaluate(model, rollouts, seed, dataset_id)
             earlier = [e for e in read_evaluations(folder, dataset_id) if e.n_updates < n_updates]

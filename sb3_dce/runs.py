@@ -24,7 +24,7 @@ from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.data import find_file
 from sb3_dce.data.hashes import file_sha256
 from sb3_dce.errors import ConfigError
-from sb3_dce.evaluation import Evaluation, EvaluationCallback, catalogue_id, make_rollouts, write_evaluations
+from sb3_dce.evaluation import Evaluation, EvaluationCallback, catalogue_id, rollouts_of, write_evaluations
 from sb3_dce.files import write_atomically
 
 # Seconds between two progress reports.
@@ -113,7 +113,7 @@ def run(spec: RunSpec, report: Report = lambda progress: None) -> dict[str, Any]
     def on_evaluation(outcome: Evaluation) -> None:
         report(Progress(spec.name, model.num_timesteps, spec.n_updates, outcome))
 
-    rollouts = None if dataset_id is None else make_rollouts(dataset_id, spec.n_eval_episodes)
+    rollouts = rollouts_of(model.dataset, spec.n_eval_episodes)
     evaluating = EvaluationCallback(
         rollouts, dataset_id, spec.eval_freq, spec.seed, folder, on_evaluation, save_checkpoint=True
     )

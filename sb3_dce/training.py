@@ -15,9 +15,10 @@ from sb3_dce.agents import agent_class
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.data import find_file
 from sb3_dce.data.catalog import resolve
+from sb3_dce.data.locate import short_name
 from sb3_dce.envs import missing_simulator
 from sb3_dce.errors import CheckpointError, ConfigError
-from sb3_dce.evaluation import Evaluation, catalogue_id, evaluate, make_rollouts, read_evaluations
+from sb3_dce.evaluation import Evaluation, catalogue_id, evaluate, read_evaluations, rollouts_of
 from sb3_dce.launch import launch
 from sb3_dce.plots import plot_learning_curves
 from sb3_dce.runs import RunSpec
@@ -56,7 +57,7 @@ def train_seeds(
     path, spec = find_file(dataset)
     row = hyperparams.load_row(algo, None if spec is None else spec.id)
     total = n_updates or hyperparams.split_row(row).n_timesteps
-    name = path.stem if spec is None else spec.id
+    name = short_name(dataset)
     folder = out or Path("runs") / f"{algo}-{name}"
     console.print(f"[b]{algo}[/b] on [b]{name}[/b] ({path}), {total:,} gradient steps, seeds {list(seeds)}")
     specs = [
@@ -106,17 +107,16 @@ def evaluate_file(model_path: Path, dataset: str | None, n_episodes: int, seed: 
     """
     model = load_any(model_path)
     dataset_id = resolve(dataset).id if dataset is not None else catalogue_id(model.dataset)
-    if dataset_id is None:
-        raise ConfigError(
-            f"the model was trained on {model.dataset!r}, which is not in the catalogue: its environment is unknown",
-            key="dataset",
-            hint="Name one with --dataset, for example --dataset halfcheetah-medium.",
-        )
-    missing = missing_simulator(resolve(dataset_id))
+    missing = None if dataset_id is None else missing_simulator(resolve(dataset_id))
     if missing is not None:
         raise ConfigError(missing.reason, key="env", hint=missing.remedy)
-    rollouts = make_rollouts(dataset_id, n_episodes)
-    assert rollouts is not None
+    rollouts = rollouts_of(dataset or model.dataset, n_episodes)
+    if rollouts is None:
+        raise ConfigError(
+            f"no environment is known for {model.dataset!r}, on which the model was trained",
+            key="dataset",
+            hint="Name a dataset of its environment with --dataset, for example --dataset halfcheetah-medium.",
+        )
     return evaluate(model, rollouts, seed, dataset_id)
 
 

@@ -25,7 +25,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from sb3_dce import OfflineDCE, cli
+from sb3_dce import OfflineDCE, cli, cli_datasets
 from sb3_dce.data import catalog, find_file, load_transitions, locking
 from sb3_dce.data import download as download_module
 from sb3_dce.data.download import Patience, download
@@ -615,7 +615,7 @@ def test_command_downloads_and_refuses_with_one_message(
     folder: Path, host: Host, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = ["sb3-dce", "datasets", "download", NAME, "--cache-dir", str(folder), "--mirror", f"{host.base}mirror"]
-    monkeypatch.setattr(cli, "console", Console(highlight=False, width=400))
+    monkeypatch.setattr(cli_datasets, "console", Console(highlight=False, width=400))
     monkeypatch.setattr(sys, "argv", command)
     with pytest.raises(SystemExit) as ended:
         cli.main()

@@ -158,3 +158,15 @@ def _not_found(spec: DatasetSpec) -> DatasetNotFoundError:
 def _available_hint() -> str:
     ids = [spec.id for spec, _ in available()]
     return f"Available now: {', '.join(ids)}" if ids else "No dataset of the catalogue is on this machine"
+
+
+def short_name(dataset: str | PathLike[str]) -> str:
+    """
+    :param dataset: id, ``minari:`` name or file
+    :return: name for folders and headings: the id, or the file's without suffix
+    :raises DatasetNotFoundError: if there is no file for it
+    """
+    if is_minari_name(dataset):
+        return dataset.removeprefix("minari:").replace("/", "-")
+    path, spec = find_file(dataset)
+    return path.stem if spec is None else spec.id

@@ -1,0 +1,163 @@
+"""What ``sb3-dce compare`` does: several agents on one dataset, one protocol, one table made from the result files."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from sb3_dce.agents import agent_class
+from sb3_dce.data import find_file, load_transitions
+from sb3_dce.data.catalog import DatasetSpec, normalized_score
+from sb3_dce.data.locate import short_name
+from sb3_dce.errors import ConfigError
+from sb3_dce.evaluation import read_evaluations
+from sb3_dce.files import write_atomically
+from sb3_dce.launch import launch
+from sb3_dce.plots import plot_learning_curves
+from sb3_dce.runs import RunSpec, read_result
+
+COLUMNS = ("agent", "seed", "n_updates", "mean_return", "normalized_score", "seconds", "seconds_per_1000")
+
+
+class Row(NamedTuple):
+    """
+    One agent over its seeds.
+
+    :param agent: name
+    :param n_seeds: complete runs
+    :param n_updates: gradient steps of each
+    :param mean: mean over the seeds of the last evaluation, score, or return without reference values
+    :param std: sample standard deviation over the seeds, NaN for one
+    :param seconds_per_1000: mean training seconds of 1000 updates, evaluations included
+    """
+
+    agent: str
+    n_seeds: int
+    n_updates: int
+    mean: float
+    std: float
+    seconds_per_1000: float
+
+
+def compare(
+    dataset: str,
+    algos: Sequence[str],
+    n_updates: int,
+    seeds: Sequence[int],
+    eval_freq: int,
+    n_eval_episodes: int,
+    workers: int,
+    out: Path | None,
+    console: Console,
+) -> list[Row]:
+    """
+    Train every agent with every seed, each with the dataset's row of its own file; show and write the comparison.
+
+    :param dataset: id or file
+    :param algos: names of agents
+    :param n_updates: gradient steps of each run
+    :param seeds: seeds
+    :param eval_freq: gradient steps between two evaluations
+    :param n_eval_episodes: episodes of each
+    :param workers: processes
+    :param out: folder of the results, default ``runs/compare-<dataset>``
+    :param console: where to print
+    :return: the table
+    :raises ConfigError: for an unknown agent
+    :raises SB3DCEError: the first error of a run; what the others have done is kept and resumed by the same call
+    """
+    if len(set(algos)) != len(algos) or not algos:
+        raise ConfigError(
+            f"name each agent once, got {', '.join(algos)}", key="--algos", hint="For example --algos dce,offline_bc."
+        )
+    for algo in algos:
+        agent_class(algo)
+    path, spec = find_file(dataset)
+    name = short_name(dataset)
+    folder = out or Path("runs") / f"compare-{name}"
+    console.print(
+        f"[b]{', '.join(algos)}[/b] on [b]{name}[/b] ({path}), {n_updates:,} gradient steps, seeds {list(seeds)}, last policy"
+    )
+    specs = [
+        RunSpec(algo, dataset, seed, n_updates, str(folder / algo / f"seed_{seed}"), eval_freq, n_eval_episodes)
+        for seed in seeds  # all agents of a seed before the next seed: an interrupted comparison is a smaller one
+        for algo in algos
+    ]
+    launch(specs, workers, console)
+    info = load_transitions(dataset).info
+    level = float(info.episode_returns.mean()) if len(info.episode_returns) else None
+    return summarize(folder, algos, spec, level, console)
+
+
+def summarize(
+    folder: Path, algos: Sequence[str], spec: DatasetSpec | None, data_return: float | None, console: Console
+) -> list[Row]:
+    """
+    Make table and picture from the result files of a comparison, complete or not.
+
+    :param folder: of the comparison
+    :param algos: names of agents
+    :param spec: catalogue entry of the dataset, if there is one
+    :param data_return: mean return of the data's episodes, if there are any
+    :param console: where to print
+    :return: one row per agent that has a complete run
+    """
+    dataset_id = None if spec is None else spec.id
+    results = {algo: [r for r in map(read_result, sorted((folder / algo).glob("seed_*"))) if r] for algo in algos}
+    results = {algo: found for algo, found in results.items() if found}
+    if not results:
+        raise ConfigError("no complete run", where=str(folder), hint="Run the comparison first; it goes on where it stopped.")
+    _write_csv(folder / "comparison.csv", results)
+    rows = [_row(algo, found, dataset_id is not None) for algo, found in results.items()]
+    level = data_return
+    if level is not None and dataset_id is not None:
+        level = float(normalized_score(dataset_id, level))
+    _show(rows, level, dataset_id is not None, console)
+    curves = {algo: [read_evaluations(run, dataset_id) for run in sorted((folder / algo).glob("seed_*"))] for algo in results}
+    levels = {} if level is None else {"mean of the data": level}
+    title = folder.name.removeprefix("compare-") if dataset_id is None else dataset_id
+    picture = plot_learning_curves(curves, folder / "comparison.png", title, levels, confidence=True)
+    console.print(f"saved  {folder}/comparison.csv" + (f", {picture.name}" if picture else ""), markup=False)
+    return rows
+
+
+def _row(algo: str, results: list[dict[str, Any]], scored: bool) -> Row:
+    values = [r["normalized_score"] if scored else r["mean_return"] for r in results]
+    known = np.array([np.nan if value is None else value for value in values], dtype=float)
+    std = float(known.std(ddof=1)) if len(known) > 1 else float("nan")
+    seconds = float(np.mean([1000 * r["seconds"] / r["n_updates"] for r in results]))
+    return Row(algo, len(results), results[0]["n_updates"], float(known.mean()), std, seconds)
+
+
+def _show(rows: list[Row], data_level: float | None, scored: bool, console: Console) -> None:
+    table = Table(box=None, header_style="bold")
+    table.add_column("agent")
+    for title in ("normalised score" if scored else "return", "± over seeds", "seeds", "updates", "s per 1000 updates"):
+        table.add_column(title, justify="right")
+    for row in sorted(rows, key=lambda row: -row.mean):
+        spread = "-" if np.isnan(row.std) else f"{row.std:.1f}"
+        cells = (f"{row.mean:.1f}", spread, str(row.n_seeds), f"{row.n_updates:,}", f"{row.seconds_per_1000:.1f}")
+        table.add_row(row.agent, *cells)
+    if data_level is not None:
+        table.add_row("mean of the data", f"{data_level:.1f}", "", "", "", "")
+    console.print(table)
+
+
+def _write_csv(path: Path, results: dict[str, list[dict[str, Any]]]) -> None:
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(COLUMNS)
+    for algo, found in results.items():
+        for r in found:
+            rate = round(1000 * r["seconds"] / r["n_updates"], 3)
+            values = (r["n_updates"], r["mean_return"], r["normalized_score"], r["seconds"], rate)
+            writer.writerow([algo, r["config"]["seed"], *values])
+    with write_atomically(path) as stream:
+        stream.write(text.getvalue().encode())

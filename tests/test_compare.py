@@ -1,0 +1,69 @@
+"""Comparing agents: one command, result files, a table and a picture made from them alone."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from sb3_dce.compare import compare, summarize
+from sb3_dce.data import resolve
+from sb3_dce.data.catalog import normalized_score
+from sb3_dce.errors import ConfigError
+from sb3_dce.plots import _interval
+
+TINY = "halfcheetah-tiny-sb3"
+
+
+def test_comparison_trains_writes_and_goes_on(tmp_path: Path) -> None:
+    quiet = Console(quiet=True)
+    arguments = (TINY, ["offline_bc", "sac_v"], 4, range(1), 2, 1, 2, tmp_path)
+    rows = compare(*arguments, quiet)
+    assert [row.agent for row in rows] == ["offline_bc", "sac_v"] and all(row.n_updates == 4 for row in rows)
+    assert (tmp_path / "comparison.png").stat().st_size > 10_000
+    with (tmp_path / "comparison.csv").open() as text:
+        written = list(csv.DictReader(text))
+    result = json.loads((tmp_path / "offline_bc" / "seed_0" / "result.json").read_text())
+    assert float(written[0]["normalized_score"]) == result["normalized_score"] == rows[0].mean
+    stamp = (tmp_path / "offline_bc" / "seed_0" / "model.zip").stat().st_mtime_ns
+    again = compare(*arguments, quiet)  # nothing is trained again
+    assert [row[:4] for row in again] == [row[:4] for row in rows]
+    assert (tmp_path / "offline_bc" / "seed_0" / "model.zip").stat().st_mtime_ns == stamp
+
+
+def test_table_is_made_from_the_complete_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scores = {"dce": [40.0, 44.0, 51.0], "offline_bc": [40.0]}
+    for algo, values in scores.items():
+        for seed, score in enumerate(values):
+            folder = tmp_path / algo / f"seed_{seed}"
+            folder.mkdir(parents=True)
+            result = {"config": {"seed": seed}, "n_updates": 2000, "seconds": 10.0, "mean_return": 1.0}
+            (folder / "result.json").write_text(json.dumps({**result, "normalized_score": score}))
+    (tmp_path / "dce" / "seed_3").mkdir()  # begun, not complete
+    rows = summarize(tmp_path, ["offline_bc", "dce", "offline_iql"], resolve(TINY), 4651.0, Console(width=120))
+    assert [(row.agent, row.n_seeds, row.mean) for row in rows] == [("offline_bc", 1, 40.0), ("dce", 3, 45.0)]
+    assert rows[1].std == pytest.approx(np.std(scores["dce"], ddof=1)) and np.isnan(rows[0].std)
+    assert rows[0].seconds_per_1000 == 5.0
+    shown = capsys.readouterr().out
+    assert shown.index("dce") < shown.index("offline_bc"), "the best first"
+    assert f"{normalized_score(TINY, 4651.0):.1f}" in shown
+
+
+def test_agents_that_do_not_exist_or_come_twice_are_refused(tmp_path: Path) -> None:
+    for algos, message in ((["dce", "dce"], "each agent once"), (["ddce"], "Did you mean 'dce'"), ([], "each agent once")):
+        with pytest.raises(ConfigError, match=message):
+            compare(TINY, algos, 4, range(1), 2, 1, 1, tmp_path, Console(quiet=True))
+    with pytest.raises(ConfigError, match="no complete run"):
+        summarize(tmp_path, ["dce"], resolve(TINY), None, Console(quiet=True))
+
+
+@pytest.mark.parametrize(("n", "quantile"), [(3, 4.3027), (5, 2.7764), (12, 2.2010), (31, 2.0423), (1000, 1.9623)])
+def test_confidence_interval_is_students(n: int, quantile: float) -> None:
+    values = np.random.default_rng(0).standard_normal((n, 2))
+    low, high = _interval(values)
+    assert np.allclose((low + high) / 2, values.mean(axis=0))
+    assert np.allclose((high - low) / 2, quantile * values.std(axis=0, ddof=1) / np.sqrt(n), rtol=2e-3)
