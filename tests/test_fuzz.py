@@ -219,8 +219,8 @@ JSON_MUTATIONS: dict[str, Mutate] = {**TEXT_MUTATIONS, "odd value": odd_value}
 TARGETS = {
     "HDF5, plain": Target("mine.hdf5", write_plain, Transitions.from_hdf5),
     "HDF5, gzip and fletcher32": Target("mine.hdf5", write_hdf5, Transitions.from_hdf5),
-    "NPZ": Target("mine.npz", lambda path, arrays: np.savez(path, **arrays), Transitions.from_npz, share=0.1),
-    "CSV": Target("mine.csv", write_csv, Transitions.from_csv, TEXT_MUTATIONS, share=0.1),
+    "NPZ": Target("mine.npz", lambda path, arrays: np.savez(path, **arrays), Transitions.from_npz, share=0.15),
+    "CSV": Target("mine.csv", write_csv, Transitions.from_csv, TEXT_MUTATIONS, share=0.15),
     "hash record (JSON)": Target("record.json", write_with_record, read_with_record, JSON_MUTATIONS, False, 0.1),
     "Minari metadata (JSON)": Target("metadata.json", write_minari, read_minari, JSON_MUTATIONS, False, 0.1),
     "settings (YAML)": Target("settings.yml", write_yaml, read_yaml, TEXT_MUTATIONS, False, 0.1),

@@ -163,6 +163,31 @@ def test_honest_but_large_hdf5_is_refused_at_little_cost(confined: Read, tmp_pat
     assert confined(path)["rows"] == 500 * N_ROWS
 
 
+def never_written(file: h5py.File, path: Path, **options: Any) -> None:
+    file.create_dataset("rewards", (N_ROWS,), "f4", **options)
+
+
+def half_written(file: h5py.File, path: Path) -> None:
+    never_written(file, path, chunks=(20,), compression="gzip")
+    file["rewards"][:100] = 1
+
+
+GAPS: list[tuple[str, Callable[[h5py.File, Path], None], str]] = [
+    ("never written", never_written, "rewards: 0 of 800 bytes are stored"),
+    ("no chunk", lambda file, path: never_written(file, path, chunks=(20,)), "rewards: 0 of 10 chunks are stored"),
+    ("half written", half_written, "rewards: 5 of 10 chunks are stored"),
+]
+
+
+@pytest.mark.parametrize(("change", "text"), [case[1:] for case in GAPS], ids=[case[0] for case in GAPS])
+def test_rows_that_are_not_stored_are_not_read_as_zeros(
+    change: Callable[[h5py.File, Path], None], text: str, confined: Read, tmp_path: Path
+) -> None:
+    path = tmp_path / "gaps.hdf5"
+    replace_rewards(change)(path)
+    assert_refused_cheaply(confined(path), INTEGRITY, (text, "read as zeros", "write all rows"))
+
+
 # -- NPZ -----------------------------------------------------------------------------------------------------------
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
+from itertools import product
 from math import prod
 from os import PathLike
 from pathlib import Path
@@ -155,10 +156,12 @@ class D4RLFile:
         :return: name to array
         :raises DatasetFormatError: if a key is a group
         :raises DatasetSecurityError: if an array lies in another file, needs a filter that is not built in, or is too large
+        :raises DatasetIntegrityError: if a part of an array is not stored
         """
         with translated_errors(self.path):
             arrays: dict[str, ArraySource] = {}
             sizes: dict[str, tuple[int, int]] = {}
+            gaps: dict[str, str] = {}
             groups: list[str] = []
             for name in names:
                 item = self._find(name)
@@ -168,6 +171,8 @@ class D4RLFile:
                 _check_storage(item, name, self.path)
                 if item.shape:
                     sizes[name] = _declared_bytes(item), item.id.get_storage_size()
+                    if text := _missing_part(item, sizes[name][1]):
+                        gaps[name] = text
                 arrays[name] = self._array(name, item)
             if groups:
                 raise DatasetFormatError(
@@ -178,6 +183,15 @@ class D4RLFile:
                     key=groups[0],
                 )
             self._check_size(sizes)
+            if gaps:
+                raise DatasetIntegrityError(
+                    "; ".join(f"{name}: {text}, which would read as zeros" for name, text in gaps.items()),
+                    where=str(self.path),
+                    hint=f"{self._again}; if the file is your own, write all rows",
+                    path=self.path,
+                    key=next(iter(gaps)),
+                    count=len(gaps),
+                )
         return arrays
 
     def _checked_names(self) -> Iterator[str]:
@@ -300,6 +314,18 @@ def _walk(root: h5py.Group, path: Path) -> Iterator[str]:
 def _declared_bytes(dataset: h5py.Dataset) -> int:
     """Size of an array, or of one of its chunks, which is unpacked as a whole and may be larger than the array."""
     return int(max(dataset.size, prod(dataset.chunks or ())) * dataset.dtype.itemsize)
+
+
+def _missing_part(dataset: h5py.Dataset, n_stored: int) -> str | None:
+    """What of an array is not in the file: never written, or its entry in the index, which has no checksum, is damaged."""
+    if dataset.chunks is None:
+        n_bytes = dataset.size * dataset.dtype.itemsize
+        return f"{n_stored:,} of {n_bytes:,} bytes are stored" if n_stored < n_bytes else None
+    starts = [range(0, rows, size) for rows, size in zip(dataset.shape, dataset.chunks, strict=True)]
+    n_chunks, found = prod(map(len, starts)), dataset.id.get_num_chunks()
+    if found >= n_chunks:  # each has to be where reading looks for it
+        found = sum(dataset.id.get_chunk_info_by_coord(start).size > 0 for start in product(*starts))
+    return f"{found:,} of {n_chunks:,} chunks are stored" if found < n_chunks else None
 
 
 def _check_link(link: Any, key: str, path: Path) -> None:
