@@ -906,12 +906,21 @@ WRONG: list[tuple[str, Any]] = [
     ("max_grad_norm", -1.0),
     ("max_grad_norm", 0.0),
     ("q_target_clip", -1.0),
+    ("fraction", 0.0),
+    ("fraction", 1.5),
+    ("alpha", -1.0),
+    ("target_policy_noise", -0.1),
+    ("target_noise_clip", -0.1),
+    ("temperature", -1.0),
+    ("max_weight", 0.0),
+    ("actor_dropout", 1.0),
+    ("actor_lr_schedule", "linear"),
 ]
 
 
 @pytest.mark.parametrize(
     ("key", "name", "value"),
-    [(key, name, value) for key in ("DCE", "BC") for name, value in WRONG if accepts(AGENTS[key], name)],
+    [(key, name, value) for key in ("DCE", "BC", "TD3BC", "IQL", "SAC") for name, value in WRONG if accepts(AGENTS[key], name)],
 )
 def test_wrong_argument_is_refused_by_the_constructor(key: str, name: str, value: Any, spaces_env: SpacesEnv) -> None:
     with pytest.raises(ConfigError, match=name):
