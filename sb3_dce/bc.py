@@ -34,6 +34,7 @@ class OfflineBC(OfflineAlgorithm):
 
     algo_name: ClassVar[str] = "offline_bc"
     networks = ("actor",)
+    population_scalars = frozenset({"fraction"})
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": ActorPolicy}
     policy: ActorPolicy
 

@@ -99,7 +99,7 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
     networks = ("actor", "critic", "critic_target", "value_net", "value_net_target")
     population_scalars = frozenset(
         {
-            *("expectile", "ent_coef", "target_entropy", "td_loss_coef"),
+            *("expectile", "td_loss_coef"),
             *("beta", "beta_final", "beta_rate", "beta_update_every", "steps_per_epoch"),
         }
     )

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 
+from sb3_dce import losses
 from sb3_dce.errors import ConfigError
+from sb3_dce.optimizers import AdamSettings, Learner
 from sb3_dce.state import Storage
+from sb3_dce.steps import descend
 
 ENT_COEF = "log_ent_coef"  # name of the learner in the state tree
 
@@ -37,6 +40,7 @@ def parse_ent_coef(ent_coef: str | float) -> tuple[bool, float]:
 class EntropyCoefficient:
     """Mixin of agents with the parameters ``ent_coef`` and ``target_entropy``; the names are those of SB3's SAC."""
 
+    population_scalars: ClassVar[frozenset[str]] = frozenset({"ent_coef", "target_entropy"})
     ent_coef: str | float
     target_entropy: str | float
     log_ent_coef: th.Tensor | None
@@ -100,3 +104,23 @@ class EntropyCoefficient:
     def _excluded_save_params(self) -> list[str]:
         names: list[Any] = super()._excluded_save_params()  # type: ignore[misc]
         return [*names, "log_ent_coef", "ent_coef_optimizer"]
+
+
+def descend_ent_coef(
+    learner: Learner, log_prob: th.Tensor, coef: dict[str, th.Tensor], settings: AdamSettings
+) -> tuple[Learner, th.Tensor]:
+    """
+    One step of the temperature.
+
+    :param learner: the learner ``log_ent_coef`` before the step
+    :param log_prob: log-probabilities of the policy's actions, shape (batch, 1), nats
+    :param coef: ``target_entropy`` and ``log_ent_coef_learning_rate``
+    :param settings: constants of the optimizer
+    :return: learner after the step, loss
+    """
+
+    def loss(log_ent_coef: th.Tensor) -> tuple[th.Tensor, tuple[()]]:
+        return losses.ent_coef_loss(log_ent_coef, log_prob, coef["target_entropy"]), ()
+
+    learner, value, _, _ = descend(loss, learner, coef["log_ent_coef_learning_rate"], settings)
+    return learner, value

@@ -249,7 +249,8 @@ def check_alike(models: Sequence[OfflineAlgorithm]) -> None:
     if not models:
         raise ConfigError("a population needs at least one model", key="models", hint="Give a specification for each member.")
     first = models[0]
-    allowed = SCALARS | type(first).population_scalars
+    own = (getattr(base, "population_scalars", ()) for base in type(first).__mro__)
+    allowed = SCALARS.union(*own)
     differing: str
     theirs: Any
     ours: Any

@@ -42,6 +42,7 @@ class OfflineTD3BC(OfflineAlgorithm):
 
     algo_name: ClassVar[str] = "offline_td3bc"
     networks = ("actor", "actor_target", "critic", "critic_target")
+    population_scalars = frozenset({"alpha", "target_policy_noise", "target_noise_clip"})
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": OfflineTD3Policy}
     policy: OfflineTD3Policy
     actor: DeterministicActor

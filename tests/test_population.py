@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import test_agents
 import torch as th
 from update_tools import all_tensors, largest_difference, needs_compiler, to_float64
 
@@ -58,6 +59,26 @@ def test_members_equal_single_runs(data: list[Transitions]) -> None:
         expected = single.read_metrics()
         expected.pop("sec_per_1000")
         assert metrics == pytest.approx(expected, rel=1e-8, abs=1e-8)
+
+
+@pytest.mark.parametrize("name", test_agents.AGENTS)
+def test_every_agent_can_be_a_member(name: str, data: list[Transitions], tmp_path: Path) -> None:
+    agent = test_agents.AGENTS[name]
+
+    def members() -> list[OfflineAlgorithm]:
+        return [test_agents.make(agent, dataset=data[0], seed=seed) for seed in range(2)]
+
+    singles = [model.learn(4, log_interval=None) for model in members()]
+    population = Population(members(), own_randomness=True)
+    population.train(4)
+    for single, member in zip(singles, population.commit(), strict=True):
+        one, other = (test_agents.weights(model) for model in (single, member))
+        # float32, whose products round differently when they are batched
+        assert one.keys() == other.keys() and all(th.allclose(one[k], other[k], atol=2e-4) for k in one)
+        member.save(tmp_path / "member.zip")
+        obs = test_agents.some_observations()
+        acts = [model.predict(obs, deterministic=True)[0] for model in (member, agent.cls.load(tmp_path / "member.zip"))]
+        assert np.array_equal(*acts) or name == "UWAC"  # whose actions are drawn
 
 
 def test_learning_rate_schedules_are_followed(data: list[Transitions]) -> None:
