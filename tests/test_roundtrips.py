@@ -316,6 +316,8 @@ def loop_over_rows(arrays: Arrays, horizon: int | None, splits_by_steps: bool = 
         if next_observation is not None:
             for values, value in zip(result, (i, next_observation, terminal, ends and not terminal, episode), strict=False):
                 values.append(value)  # type: ignore[union-attr]
+        elif limit and step > 1:
+            result.timeouts[-1] = True  # the row at the limit is left out, so its episode ends one row earlier
         if ends:
             result.returns.append(total)
             result.lengths.append(step)
