@@ -124,7 +124,11 @@ def _parse_overrides(pairs: list[str]) -> dict[str, Any]:
         key, equals, text = pair.partition("=")
         if not equals or not key:
             raise ConfigError(f"--set wants KEY=VALUE, got {pair!r}", key="--set", hint="For example --set beta=2.0.")
-        value = yaml.safe_load(text)
+        try:
+            value = yaml.safe_load(text)
+        except (yaml.YAMLError, ValueError, RecursionError) as error:
+            example = "For example --set policy_kwargs={net_arch: [64]}."
+            raise ConfigError(f"--set {key}: {text[:60]!r} is no YAML value", key="--set", hint=example) from error
         if isinstance(value, str):  # YAML 1.1 takes 3e-4 for text
             try:
                 value = float(value)

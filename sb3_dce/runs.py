@@ -23,10 +23,11 @@ from sb3_dce.agents import agent_class
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.data import find_file
 from sb3_dce.data.hashes import file_sha256
-from sb3_dce.errors import ConfigError
+from sb3_dce.errors import CheckpointError, ConfigError
 from sb3_dce.evaluation import Evaluation, EvaluationCallback, catalogue_id, rollouts_of, write_evaluations
 from sb3_dce.files import write_atomically
 
+OTHER_FOLDER = "Choose another folder with --out, or delete this one."
 # Seconds between two progress reports.
 REPORT_INTERVAL = 0.5
 
@@ -158,9 +159,9 @@ def read_result(folder: Path) -> dict[str, Any] | None:
     """
     :param folder: folder of a run
     :return: its result, ``None`` if it is not complete
+    :raises CheckpointError: if the file is damaged
     """
-    path = folder / "result.json"
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+    return _read(folder / "result.json", json.loads)
 
 
 def _config(spec: RunSpec) -> dict[str, Any]:
@@ -175,14 +176,14 @@ def refuse_other_run(spec: RunSpec, folder: Path) -> None:
     :param folder: where a run may have been begun
     :raises ConfigError: if that was another one
     """
-    path = folder / "config.yml"
-    if not path.is_file():
+    config = _read(folder / "config.yml", yaml.safe_load)
+    if config is None:
         return
-    config = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    begun, wanted = config.get("run", {}), _plain(_config(spec))
+    begun, data = (part if isinstance(part, dict) else {} for part in (config.get("run"), config.get("dataset")))
+    wanted = _plain(_config(spec))
     differing = [key for key in wanted if key not in ("n_updates", "dataset") and begun.get(key) != wanted[key]]
     # The same data may be named otherwise: by an id, from another folder, after a move.
-    if config.get("dataset", {}).get("sha256") != file_sha256(find_file(spec.dataset)[0]):
+    if data.get("sha256") != file_sha256(find_file(spec.dataset)[0]):
         differing.append("dataset")
     done = read_result(folder)
     if done is not None and done["n_updates"] > spec.n_updates:
@@ -193,8 +194,21 @@ def refuse_other_run(spec: RunSpec, folder: Path) -> None:
             f"the folder holds a run with other settings: {changes}",
             where=str(folder),
             path=folder,
-            hint="Choose another folder with --out, or delete this one.",
+            hint=OTHER_FOLDER,
         )
+
+
+def _read(path: Path, parse: Callable[[str], Any]) -> dict[str, Any] | None:
+    """A file of a run, None if there is none."""
+    if not path.is_file():
+        return None
+    try:
+        content = parse(path.read_text(encoding="utf-8"))
+    except (ValueError, yaml.YAMLError, RecursionError, OSError) as error:
+        raise CheckpointError("the file is damaged", where=str(path), path=path, hint=OTHER_FOLDER) from error
+    if not isinstance(content, dict):
+        raise CheckpointError("the file is not that of a run", where=str(path), path=path, hint=OTHER_FOLDER)
+    return content
 
 
 def _model(spec: RunSpec, folder: Path) -> OfflineAlgorithm:

@@ -122,6 +122,21 @@ def test_a_folder_with_another_run_is_refused(trained: tuple[Path, Outcome]) -> 
     assert "other settings" in message and "--out" in message
 
 
+@pytest.mark.parametrize(("name", "text"), [("config.yml", "a: [1"), ("config.yml", "- 1"), ("result.json", "{")])
+def test_a_damaged_run_folder_is_said_and_left_alone(
+    name: str, text: str, trained: tuple[Path, Outcome], tmp_path: Path
+) -> None:
+    shutil.copytree(trained[0] / "runs" / f"dce-{TINY}", tmp_path / "run")
+    (tmp_path / "run" / "seed_0" / name).write_text(text)
+    message = refused(sb3_dce(*TRAIN, "--out", str(tmp_path / "run")))
+    assert name in message and "--out" in message
+    assert (tmp_path / "run" / "seed_0" / name).read_text() == text
+
+
+def test_a_setting_that_is_no_yaml_is_refused() -> None:
+    assert "no YAML value" in refused(sb3_dce("train", TINY, "--set", "policy_kwargs={net_arch: [16"))
+
+
 def test_a_run_goes_on_with_the_same_data_from_another_place_and_with_no_other(
     trained: tuple[Path, Outcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

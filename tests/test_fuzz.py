@@ -362,12 +362,8 @@ def hunt(name: str, count: int) -> Results:
 needs_linux = pytest.mark.skipif(sys.platform != "linux", reason="limits of memory and time as Linux has them")
 
 
-CASES = [name for name in TARGETS if name != "settings (YAML)"]
-YAML_ERRORS = pytest.mark.xfail(reason="--set passes on the errors of the YAML parser")
-
-
 @needs_linux
-@pytest.mark.parametrize("name", [*CASES, pytest.param("settings (YAML)", marks=YAML_ERRORS)])
+@pytest.mark.parametrize("name", TARGETS)
 def test_damaged_files_never_crash_hang_or_pass_for_the_recorded_one(name: str) -> None:
     count = TARGETS[name].count(N_HDF5)
     results = hunt(name, count)

@@ -374,3 +374,12 @@ def test_episode_whose_last_row_is_left_out_ends_one_row_earlier(options: dict[s
     again = Transitions.from_hdf5(tmp_path / "again.hdf5")
     assert np.array_equal(again.rows, data.rows) and np.array_equal(again.timeouts, data.timeouts)
     assert again.info.episode_lengths.tolist() == [2, 1] and not any("jumps" in note for note in again.info.notes)
+
+
+def test_end_of_an_episode_is_kept_when_the_row_before_it_is_dropped_too() -> None:
+    timeouts = np.array([0, 0, 0, 1, 0, 0, 1], dtype=bool)
+    rewards = np.array([1.0, 2, np.nan, 4, np.nan, np.nan, 7])
+    data = Transitions.from_arrays(
+        np.arange(7.0)[:, None], np.zeros((7, 1)), rewards, np.zeros(7, bool), timeouts, drop_nonfinite=True
+    )
+    assert data.observations[:, 0].tolist() == [0, 1] and data.timeouts.tolist() == [False, True]

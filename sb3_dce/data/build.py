@@ -154,10 +154,12 @@ def build_rows(
 
 
 def _ends_of_used(episodes: Episodes, used: np.ndarray) -> np.ndarray:
-    """Timeouts of the used rows: where the row at the limit is left out, its episode ends one row earlier."""
-    ends = episodes.timeouts.copy()
-    left_out = np.flatnonzero(ends[1:] & ~used[1:] & (episodes.index[1:] == episodes.index[:-1])) + 1
-    ends[left_out - 1] = True
+    """Timeouts of the used rows: where the row at the limit is left out, its episode ends with the last used row before."""
+    ends, rows = episodes.timeouts.copy(), np.flatnonzero(used)
+    left_out = np.flatnonzero(ends & ~used)
+    before = rows[np.maximum(np.searchsorted(rows, left_out) - 1, 0)]
+    same_episode = (before < left_out) & (episodes.index[before] == episodes.index[left_out])
+    ends[before[same_episode]] = True
     return ends[used]
 
 
