@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from sb3_dce.pbrl import OfflinePBRL
     from sb3_dce.sac import OfflineSAC
     from sb3_dce.td3_bc import OfflineTD3BC
+    from sb3_dce.uwac import OfflineUWAC
 
 __version__ = "0.1.0"
 
@@ -36,6 +37,7 @@ _AGENTS = {
     "OfflineSAC": "sb3_dce.sac",
     "OfflineSACV": "sb3_dce.dce_variants",
     "OfflineTD3BC": "sb3_dce.td3_bc",
+    "OfflineUWAC": "sb3_dce.uwac",
 }
 
 __all__ = [
@@ -48,6 +50,7 @@ __all__ = [
     "OfflineSAC",
     "OfflineSACV",
     "OfflineTD3BC",
+    "OfflineUWAC",
     "Transitions",
     "__version__",
     "load_dataset",

@@ -11,6 +11,7 @@ from sb3_dce.hyperparams import did_you_mean
 from sb3_dce.iql import OfflineIQL
 from sb3_dce.sac import OfflineSAC
 from sb3_dce.td3_bc import OfflineTD3BC
+from sb3_dce.uwac import OfflineUWAC
 
 _CLASSES: tuple[type[OfflineAlgorithm], ...] = (
     OfflineDCE,
@@ -20,6 +21,7 @@ _CLASSES: tuple[type[OfflineAlgorithm], ...] = (
     OfflineSAC,
     OfflineSACV,
     OfflineCQLEq18,
+    OfflineUWAC,
 )
 AGENTS: dict[str, type[OfflineAlgorithm]] = {agent.algo_name: agent for agent in _CLASSES}
 

@@ -347,3 +347,69 @@ def pessimistic_values(
     """
     lowered = q_values - weight * uncertainty
     return lowered if floor is None else lowered.clamp(min=floor)
+
+
+def gaussian_kl(mean: th.Tensor, log_std: th.Tensor) -> th.Tensor:
+    """
+    Kullback-Leibler divergence of a Gaussian from the standard one, as a mean over batch *and* dimensions (BCQ, BEAR).
+
+    :param mean: shape (..., batch, latent_dim)
+    :param log_std: shape (..., batch, latent_dim)
+    :return: shape (...), nats per dimension
+    """
+    return -0.5 * batch_mean(1.0 + 2.0 * log_std - mean.square() - (2.0 * log_std).exp())
+
+
+def soft_clipped_values(q_values: th.Tensor) -> th.Tensor:
+    """
+    ``0.75 * min_i Q_i + 0.25 * max_i Q_i`` over the critics (BCQ; Fujimoto et al., 2019, Eq. 13).
+
+    :param q_values: shape (n_critics, ...), reward units
+    :return: shape (...)
+    """
+    return 0.75 * q_values.amin(dim=0) + 0.25 * q_values.amax(dim=0)
+
+
+def uncertainty_weight(variances: th.Tensor, uwac_beta: float | th.Tensor) -> th.Tensor:
+    """
+    ``exp(-beta * var)`` of UWAC. It lies in (0, 1], so that the authors' clip to [0, 1] changes nothing.
+
+    :param variances: of the dropout passes, added over the critics, any shape, squared reward units
+    :param uwac_beta: UWAC's beta; 0 trusts every target alike
+    :return: same shape
+    """
+    return (-uwac_beta * variances).exp()
+
+
+def weighted_td_loss(q_values: th.Tensor, target_q_values: th.Tensor, weights: th.Tensor, squared: bool) -> th.Tensor:
+    """
+    ``mean((w * (Q_i - y))^2)`` summed over the critics, as in UWAC's code; its paper (Wu et al., 2021) has w once.
+
+    :param q_values: shape (n_critics, ..., batch, 1), reward units
+    :param target_q_values: without gradient, shape (..., batch, 1)
+    :param weights: without gradient, shape (..., batch, 1)
+    :param squared: weigh by w^2 (code) instead of w (paper)
+    :return: shape (...)
+    """
+    weights = weights.square() if squared else weights
+    return batch_mean(weights * (q_values - target_q_values).square()).sum(dim=0)
+
+
+def gaussian_mmd(samples: th.Tensor, other_samples: th.Tensor, sigma: float | th.Tensor) -> th.Tensor:
+    """
+    Maximum mean discrepancy with the kernel ``exp(-|x - y|^2 / (2 sigma))`` of BEAR (Kumar et al., 2019), per state.
+
+    ``sqrt(k(x, x) + k(y, y) - 2 k(x, y) + 1e-6)`` with means over all pairs, equal ones included.
+
+    :param samples: shape (n, ..., batch, dim)
+    :param other_samples: shape (m, ..., batch, dim)
+    :param sigma: width of the kernel; 20 in UWAC
+    :return: shape (..., batch, 1)
+    """
+
+    def kernel(x: th.Tensor, y: th.Tensor) -> th.Tensor:
+        distances = (x.unsqueeze(0) - y.unsqueeze(1)).square().sum(dim=-1, keepdim=True)
+        return (-distances / (2.0 * sigma)).exp().mean(dim=(0, 1))
+
+    own, others = kernel(samples, samples), kernel(other_samples, other_samples)
+    return (own + others - 2.0 * kernel(samples, other_samples) + 1e-6).sqrt()

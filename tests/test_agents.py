@@ -47,6 +47,7 @@ from sb3_dce import (
     OfflineSAC,
     OfflineSACV,
     OfflineTD3BC,
+    OfflineUWAC,
     Transitions,
 )
 from sb3_dce.base import OfflineAlgorithm
@@ -96,6 +97,15 @@ AGENTS = {
     "SAC": Agent(OfflineSAC, {}, f"{Q_METRICS} q_policy q_gap ent_coef ent_coef_loss entropy action_sat"),
     "SAC-V": Agent(OfflineSACV, {}, f"{CRITIC_METRICS} {VALUE_METRICS}"),
     "CQL-Eq18": Agent(OfflineCQLEq18, {"beta": 1.0}, CRITIC_METRICS.replace("ent_coef_loss", "")),
+    "UWAC": Agent(
+        OfflineUWAC,
+        {
+            **{"n_mc_dropout": 4, "n_target_actions": 3, "n_mmd_actions": 2, "n_predict_actions": 5, "vae_net_arch": [12, 12]},
+            **{"policy_eval_start": 2, "actor_learning_rate": None},
+        },
+        f"{Q_METRICS} twin_gap vae_loss vae_mse vae_kl grad_norm_vae target_variance weight weight_min mmd alpha entropy "
+        "action_sat q_policy q_gap policy_variance policy_weight",
+    ),
 }
 
 
@@ -915,12 +925,29 @@ WRONG: list[tuple[str, Any]] = [
     ("max_weight", 0.0),
     ("actor_dropout", 1.0),
     ("actor_lr_schedule", "linear"),
+    ("actor_learning_rate", 0.0),
+    ("alpha_learning_rate", -1e-3),
+    ("n_mc_dropout", 1),
+    ("uwac_beta", -0.5),
+    ("n_target_actions", 0),
+    ("n_mmd_actions", 0),
+    ("mmd_sigma", 0.0),
+    ("mmd_threshold", -0.1),
+    ("policy_eval_start", -1),
+    ("actor_q_timing", "later"),
+    ("n_predict_actions", 0),
+    ("vae_net_arch", [0]),
 ]
 
 
 @pytest.mark.parametrize(
     ("key", "name", "value"),
-    [(key, name, value) for key in ("DCE", "BC", "TD3BC", "IQL", "SAC") for name, value in WRONG if accepts(AGENTS[key], name)],
+    [
+        (key, name, value)
+        for key in ("DCE", "BC", "TD3BC", "IQL", "SAC", "UWAC")
+        for name, value in WRONG
+        if accepts(AGENTS[key], name)
+    ],
 )
 def test_wrong_argument_is_refused_by_the_constructor(key: str, name: str, value: Any, spaces_env: SpacesEnv) -> None:
     with pytest.raises(ConfigError, match=name):

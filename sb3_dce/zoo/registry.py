@@ -148,6 +148,27 @@ def sample_cql_eq18_params(
     return convert_critic_params({**drawn, "beta": trial.suggest_float("beta", 0.03, 30.0, log=True)})
 
 
+def sample_uwac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    Draw hyperparameters of UWAC; see :func:`sample_dce_params`.
+
+    :param trial: trial of the search
+    :param n_actions: unused
+    :param n_envs: unused
+    :param additional_args: unused
+    :return: constructor keywords
+    """
+    return convert_critic_params(
+        {
+            **_sample_optimizer(trial),
+            **_sample_bootstrap(trial),
+            "uwac_beta": trial.suggest_float("uwac_beta", 0.01, 10.0, log=True),
+            "critic_dropout": trial.suggest_float("critic_dropout", 0.05, 0.3),
+            "mmd_threshold": trial.suggest_float("mmd_threshold", 0.01, 0.3, log=True),
+        }
+    )
+
+
 def convert_critic_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
     :param sampled_params: parameters of a trial of an agent with critics
@@ -180,6 +201,7 @@ SAMPLERS: dict[str, Callable[..., dict[str, Any]]] = {
     "offline_sac": sample_sac_params,
     "sac_v": sample_sac_v_params,
     "cql_eq18": sample_cql_eq18_params,
+    "offline_uwac": sample_uwac_params,
 }
 CONVERTERS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "dce": convert_dce_params,
@@ -189,6 +211,7 @@ CONVERTERS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "offline_sac": convert_critic_params,
     "sac_v": convert_critic_params,
     "cql_eq18": convert_critic_params,
+    "offline_uwac": convert_critic_params,
 }
 
 
