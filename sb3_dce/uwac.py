@@ -18,7 +18,8 @@ from sb3_dce.execution import Update
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.state import PureNet, Storage
 from sb3_dce.steps import descend, polyak
-from sb3_dce.uwac_networks import ActionVAE, DropoutCritic, UWACPolicy
+from sb3_dce.uwac_networks import ActionVAE, DropoutCritic
+from sb3_dce.uwac_policy import UWACPolicy
 
 # Names in the state tree: the multiplier of the MMD constraint, and the vectors of the critics' power iteration.
 LOG_ALPHA = "log_alpha"
@@ -48,7 +49,7 @@ class OfflineUWAC(OfflineAlgorithm):
     learned multiplier alpha. The critics have spectral normalisation on every layer and dropout that is never switched
     off; mean and variance of ``n_mc_dropout`` passes give the value and the weight ``exp(-uwac_beta * variance)`` of a
     target and of the policy's own action. ``predict`` takes the best of 100 sampled actions, see
-    :class:`~sb3_dce.uwac_networks.UWACPolicy`.
+    :class:`~sb3_dce.uwac_policy.UWACPolicy`.
 
     This agent is slow by its nature: 2560 next actions are valued 100 times by each critic at every update.
 
@@ -197,6 +198,7 @@ class OfflineUWAC(OfflineAlgorithm):
             "critic_dropout": self.critic_dropout,
             "n_mc_dropout": self.n_mc_dropout,
             "n_predict_actions": self.n_predict_actions,
+            "predict_seed": 0 if self.seed is None else self.seed,
         }
         return settings if self.vae_net_arch is None else {**settings, "vae_net_arch": self.vae_net_arch}
 

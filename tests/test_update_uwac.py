@@ -30,7 +30,7 @@ from update_tools import (
     to_float64,
 )
 
-from sb3_dce import OfflineUWAC, Transitions, losses, uwac_networks
+from sb3_dce import OfflineUWAC, Transitions, losses, uwac_networks, uwac_policy
 from sb3_dce.uwac_networks import DropoutCritic, SpectralLinear, most_dropped
 
 BATCH = 8
@@ -503,6 +503,14 @@ def test_seed_decides_the_candidates(transitions: Transitions) -> None:
     assert not th.equal(noises[0], noises[2])
 
 
+def test_numbers_of_passes_and_candidates_can_change_at_load(hdf5_file: Path, tmp_path: Path) -> None:
+    model = OfflineUWAC("MlpPolicy", dataset=hdf5_file, execution="eager", policy_kwargs={"net_arch": [8, 8]}, **SMALL)
+    model.learn(2).save(tmp_path / "model")
+    loaded = OfflineUWAC.load(tmp_path / "model", n_mc_dropout=7, n_predict_actions=9)
+    assert loaded.policy.candidate_noise.shape == (9, 1, 2)
+    assert loaded.learn(2, reset_num_timesteps=False).predict(observations())[0].shape == (5, 2)
+
+
 def test_sampled_prediction_draws_anew_and_follows_the_seed(transitions: Transitions) -> None:
     model = make_model(transitions)
     obs, drawn = observations(), []
@@ -517,7 +525,7 @@ def test_sampled_prediction_draws_anew_and_follows_the_seed(transitions: Transit
 def test_many_observations_are_predicted_in_blocks(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
     model, obs = make_model(transitions), observations(7)
     at_once = model.predict(obs, deterministic=True)[0]
-    monkeypatch.setattr(uwac_networks, "BLOCK_ROWS", 12)  # two observations of six candidates
+    monkeypatch.setattr(uwac_policy, "BLOCK_ROWS", 12)  # two observations of six candidates
     assert np.allclose(at_once, model.predict(obs, deterministic=True)[0], atol=1e-7)
 
 
