@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.bc import OfflineBC
+from sb3_dce.cql import OfflineCQL
 from sb3_dce.dce import OfflineDCE
 from sb3_dce.dce_variants import OfflineCQLEq18, OfflineSACV
 from sb3_dce.errors import ConfigError
 from sb3_dce.hyperparams import did_you_mean
 from sb3_dce.iql import OfflineIQL
+from sb3_dce.pbrl import OfflinePBRL
 from sb3_dce.sac import OfflineSAC
 from sb3_dce.td3_bc import OfflineTD3BC
 from sb3_dce.uwac import OfflineUWAC
@@ -21,6 +23,8 @@ _CLASSES: tuple[type[OfflineAlgorithm], ...] = (
     OfflineSAC,
     OfflineSACV,
     OfflineCQLEq18,
+    OfflineCQL,
+    OfflinePBRL,
     OfflineUWAC,
 )
 AGENTS: dict[str, type[OfflineAlgorithm]] = {agent.algo_name: agent for agent in _CLASSES}

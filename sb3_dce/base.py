@@ -195,6 +195,20 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         """
         return n_updates + 1
 
+    def reads_state_after(self, n_updates: int) -> bool:
+        """
+        :param n_updates: completed updates
+        :return: whether :meth:`read_state` is to be called now. Reading waits for the device: let it be rare
+        """
+        return False
+
+    def read_state(self, state: dict[str, Any]) -> None:
+        """
+        Adapt a parameter to what the updates have found.
+
+        :param state: state tree of the model on the device
+        """
+
     def policy_settings(self) -> dict[str, Any]:
         """
         :return: arguments of the policy that follow from the agent's own parameters
@@ -327,6 +341,8 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
                 noise = {name: spec.draw(generator, self.device, dtype) for name, spec in specs.items()}
                 engine.step(batch, noise, self._coefficient_tensors(dtype), **self.update_variant(self._n_updates))
                 self._n_updates += 1
+                if self.reads_state_after(self._n_updates):
+                    self.read_state(engine.state.read())
 
     def _bound_engine(self, planned_updates: int) -> Engine[TrainState]:
         """

@@ -132,6 +132,10 @@ class Population:
                 indices, noise = self._draw(first.batch_size)
                 engine.step(self._gather(indices), noise, self._coefficients(total), **first.update_variant(self._n_updates))
                 self._n_updates += 1
+                if first.reads_state_after(self._n_updates):
+                    for index, model in enumerate(self.models):
+                        model._n_updates = self._n_updates
+                        model.read_state(self.state.member(index))
         for model in self.models:
             model._n_updates = self._n_updates
 

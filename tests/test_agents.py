@@ -41,9 +41,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize, VecVideo
 
 from sb3_dce import (
     OfflineBC,
+    OfflineCQL,
     OfflineCQLEq18,
     OfflineDCE,
     OfflineIQL,
+    OfflinePBRL,
     OfflineSAC,
     OfflineSACV,
     OfflineTD3BC,
@@ -97,6 +99,21 @@ AGENTS = {
     "SAC": Agent(OfflineSAC, {}, f"{Q_METRICS} q_policy q_gap ent_coef ent_coef_loss entropy action_sat"),
     "SAC-V": Agent(OfflineSACV, {}, f"{CRITIC_METRICS} {VALUE_METRICS}"),
     "CQL-Eq18": Agent(OfflineCQLEq18, {"beta": 1.0}, CRITIC_METRICS.replace("ent_coef_loss", "")),
+    "CQL": Agent(
+        OfflineCQL,
+        {"n_actions": 2, "policy_eval_start": 3, "lagrange_threshold": 1.0, "actor_learning_rate": None},
+        f"{Q_METRICS} q0_data q1_data q_policy q_next_policy q_uniform q_gap twin_gap cql_gap cql_penalty lagrange ent_coef "
+        "ent_coef_loss entropy action_sat bc_loss",
+    ),
+    "PBRL": Agent(
+        OfflinePBRL,
+        {
+            **{"n_critics": 3, "n_ood_actions": 2, "prior_scale": 1.0, "actor_learning_rate": None},
+            **{"adaptive_ood_weight": True, "ood_weight_steps": 4},
+        },
+        f"{Q_METRICS} q_policy q_next_policy q_gap uncertainty_data uncertainty_policy uncertainty_next ood_loss ood_weight "
+        "ent_coef ent_coef_loss entropy action_sat",
+    ),
     "UWAC": Agent(
         OfflineUWAC,
         {
@@ -660,6 +677,8 @@ class WithBatchNorm(TwoLayers):
     ids=str,
 )
 def test_policy_arguments(agent: Agent, hdf5_file: Path, tmp_path: Path, policy_kwargs: dict[str, Any]) -> None:
+    if "n_critics" in policy_kwargs and accepts(agent, "n_critics"):
+        pytest.skip("an argument of the agent, refused here")
     model = make(agent, dataset=hdf5_file, policy_kwargs=policy_kwargs)
     start = weights(model)
     model.learn(3)
@@ -937,6 +956,22 @@ WRONG: list[tuple[str, Any]] = [
     ("actor_q_timing", "later"),
     ("n_predict_actions", 0),
     ("vae_net_arch", [0]),
+    ("cql_weight", -1.0),
+    ("n_actions", 0),
+    ("lagrange_threshold", -1.0),
+    ("lagrange_form", "squared"),
+    ("n_critics", 1),
+    ("uncertainty_coef", -0.01),
+    ("n_ood_actions", 0),
+    ("ood_weight", -1.0),
+    ("ood_weight_final", -1.0),
+    ("ood_weight_steps", 0),
+    ("ood_weight_next", -1.0),
+    ("ood_weight_decay", 1.0),
+    ("ood_weight_min", -1.0),
+    ("steps_per_epoch", 0),
+    ("pseudo_target_floor", float("nan")),
+    ("prior_scale", -1.0),
 ]
 
 
@@ -944,7 +979,7 @@ WRONG: list[tuple[str, Any]] = [
     ("key", "name", "value"),
     [
         (key, name, value)
-        for key in ("DCE", "BC", "TD3BC", "IQL", "SAC", "UWAC")
+        for key in ("DCE", "BC", "TD3BC", "IQL", "SAC", "CQL", "PBRL", "UWAC")
         for name, value in WRONG
         if accepts(AGENTS[key], name)
     ],

@@ -169,6 +169,56 @@ def sample_uwac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additio
     )
 
 
+def sample_cql_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    Draw hyperparameters of CQL; see :func:`sample_dce_params`.
+
+    :param trial: trial of the search
+    :param n_actions: unused
+    :param n_envs: unused
+    :param additional_args: unused
+    :return: constructor keywords
+    """
+    return convert_critic_params(
+        {
+            **_sample_optimizer(trial),
+            **_sample_bootstrap(trial),
+            "actor_learning_rate": trial.suggest_float("actor_learning_rate", 1e-5, 1e-3, log=True),
+            "cql_weight": trial.suggest_float("cql_weight", 0.1, 20.0, log=True),
+        }
+    )
+
+
+def sample_pbrl_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+    """
+    Draw hyperparameters of PBRL; the weight at s is searched as a constant. See :func:`sample_dce_params`.
+
+    :param trial: trial of the search
+    :param n_actions: unused
+    :param n_envs: unused
+    :param additional_args: unused
+    :return: constructor keywords
+    """
+    return convert_pbrl_params(
+        {
+            **_sample_optimizer(trial),
+            **_sample_bootstrap(trial),
+            "actor_learning_rate": trial.suggest_float("actor_learning_rate", 1e-5, 1e-3, log=True),
+            "uncertainty_coef": trial.suggest_float("uncertainty_coef", 1e-5, 0.1, log=True),
+            "ood_weight": trial.suggest_float("ood_weight", 1e-3, 5.0, log=True),
+            "ood_weight_next": trial.suggest_float("ood_weight_next", 1e-3, 1.0, log=True),
+        }
+    )
+
+
+def convert_pbrl_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+    """
+    :param sampled_params: parameters of a trial, as drawn by :func:`sample_pbrl_params`
+    :return: constructor keywords; a schedule in the row is switched off, since it belongs to another start value
+    """
+    return {**convert_critic_params(sampled_params), "ood_weight_final": None, "adaptive_ood_weight": False}
+
+
 def convert_critic_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
     :param sampled_params: parameters of a trial of an agent with critics
@@ -201,6 +251,8 @@ SAMPLERS: dict[str, Callable[..., dict[str, Any]]] = {
     "offline_sac": sample_sac_params,
     "sac_v": sample_sac_v_params,
     "cql_eq18": sample_cql_eq18_params,
+    "offline_cql": sample_cql_params,
+    "offline_pbrl": sample_pbrl_params,
     "offline_uwac": sample_uwac_params,
 }
 CONVERTERS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
@@ -211,6 +263,8 @@ CONVERTERS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "offline_sac": convert_critic_params,
     "sac_v": convert_critic_params,
     "cql_eq18": convert_critic_params,
+    "offline_cql": convert_critic_params,
+    "offline_pbrl": convert_pbrl_params,
     "offline_uwac": convert_critic_params,
 }
 
