@@ -633,7 +633,14 @@ def test_actions_have_the_bounds_and_type_of_their_space(
     rows = random_transitions(act_dim=2)
     actions = ((rows.actions + 1) / 2 * (high - low) + low).astype(np.float32)
     data = Transitions.from_arrays(
-        rows.observations, actions, rows.rewards, rows.terminals, rows.timeouts, action_low=low, action_high=high
+        rows.observations,
+        actions,
+        rows.rewards,
+        rows.terminals,
+        rows.timeouts,
+        rows.next_observations,
+        action_low=low,
+        action_high=high,
     )
     model = make(agent, env=env, dataset=data).learn(3)
     held = model.replay_buffer.actions[:, 0]
