@@ -85,6 +85,13 @@ class NumpyPolicy(ABC):
         """
         return rng.standard_normal((n, self.act_dim))
 
+    @property
+    def weight_bytes(self) -> int:
+        """
+        :return: size of the arrays that are read for every action
+        """
+        return 0
+
     @abstractmethod
     def act(self, obs: np.ndarray, noise: np.ndarray | None = None, step: int = 0) -> np.ndarray:
         """
@@ -165,6 +172,13 @@ class MLPPolicy(NumpyPolicy):
             self._std = np.exp(np.asarray(log_std, dtype=np.float64))
         if squash != "none":
             self._middle, self._half_range = (self.high + self.low) / 2, (self.high - self.low) / 2
+
+    @property
+    def weight_bytes(self) -> int:
+        """
+        :return: size of the arrays that are read for every action
+        """
+        return sum(weight.nbytes for weight, _ in self.layers)
 
     def act(self, obs: np.ndarray, noise: np.ndarray | None = None, step: int = 0) -> np.ndarray:
         drawn, std = self.distribution(obs, step, with_std=noise is not None)

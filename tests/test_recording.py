@@ -21,17 +21,18 @@ from sb3_dce.envs import make_env_if_possible
 from sb3_dce.errors import CheckpointError, ConfigError, DatasetSemanticsError
 from sb3_dce.numpy_policy import MLPPolicy
 from sb3_dce.recording import RecordingSpec, record
-from sb3_dce.recording.episodes import EpisodeRunner, make_env
+from sb3_dce.recording.episodes import SIDE_BY_SIDE, EpisodeRunner, concatenate, make_env
 from sb3_dce.recording.policy_files import read_npz_policy, write_npz_policy
 
 RANDOM = RecordingSpec("random", "Hopper-v4", seed=5)
 
 
-def hopper_npz(path: Path, seed: int = 0) -> Path:
-    """A small stochastic policy for Hopper, with weights that make it fall at different times."""
-    rng = np.random.default_rng(seed)
-    layers = [(0.3 * rng.normal(size=(11, 16)), np.zeros(16)), (0.3 * rng.normal(size=(16, 3)), np.zeros(3))]
-    std = (0.1 * rng.normal(size=(16, 3)), np.full(3, -1.0))
+def hopper_npz(path: Path, width: int = 16) -> Path:
+    """A stochastic policy for Hopper, with weights that make it fall at different times."""
+    rng = np.random.default_rng(0)
+    shapes, scale = ((11, width), (width, width), (width, 3)), 0.3 * (16 / width) ** 0.5
+    layers = [(scale * rng.normal(size=shape), np.zeros(shape[1])) for shape in shapes]
+    std = (0.1 * rng.normal(size=(width, 3)), np.full(3, -1.0))
     write_npz_policy(
         MLPPolicy(layers, "tanh", -np.ones(3), np.ones(3), squash="draw", log_std=std),
         path,
@@ -128,6 +129,18 @@ def test_file_is_the_same_for_any_number_of_workers(policy: Path, tmp_path: Path
     spec = RecordingSpec(str(policy), "Hopper-v4", seed=1)
     made = [record(spec, tmp_path / f"{n}.hdf5", n_rows=700, name="x-sb3", workers=n) for n in (1, 2)]
     assert made[0].path.read_bytes() == made[1].path.read_bytes()
+
+
+def test_episodes_of_a_large_policy_side_by_side_are_those_one_by_one(tmp_path: Path) -> None:
+    large = hopper_npz(tmp_path / "large.npz", width=256)
+    runner = EpisodeRunner(RecordingSpec(str(large), "Hopper-v4", seed=2, noise=0.1))
+    assert runner.width == SIDE_BY_SIDE > 1 == EpisodeRunner(RANDOM).width
+    together, lengths = runner.run_many(0, 11)
+    assert len(lengths) == 11 and len(set(lengths)) > 3
+    single = concatenate([runner.run(number) for number in range(11)])
+    assert all(np.array_equal(together[key], single[key]) for key in single)
+    made = record(runner.spec, tmp_path / "x.hdf5", n_episodes=11)
+    assert all(np.array_equal(array, single[key]) for key, array in read(made.path).items())
 
 
 def test_longer_recording_begins_with_the_shorter_one(tmp_path: Path) -> None:
@@ -359,7 +372,7 @@ def test_command_interrupted_while_it_writes_loses_nothing(tmp_path: Path, monke
         patch.setattr("sb3_dce.recording.recorder.write_hdf5", interrupted)
         code, _, stderr = sb3_dce(*command)
     assert code == 130 and "the same command goes on" in stderr
-    monkeypatch.setattr(EpisodeRunner, "run", interrupted)  # nothing is left to be recorded
+    monkeypatch.setattr(EpisodeRunner, "run_many", interrupted)  # nothing is left to be recorded
     assert sb3_dce(*command)[0] == 0
     assert len(read(tmp_path / "x.hdf5")["rewards"]) == 200
 

@@ -12,7 +12,7 @@ import contextlib
 import importlib
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium as gym
@@ -29,6 +29,9 @@ from sb3_dce.recording.policy_files import PolicyFacts, load_policy
 Arrays = dict[str, np.ndarray]
 
 DECIMALS = 4
+# Episodes that take their steps in turn, and the size of the weights from which on it pays.
+SIDE_BY_SIDE = 8
+_LARGE_BYTES = 2**17
 
 
 @dataclass(frozen=True)
@@ -74,9 +77,22 @@ class RecordingSpec:
             )
 
 
+@dataclass
+class _Track:
+    """What has been seen of an episode; one observation more than there are steps."""
+
+    observations: list[Any] = field(default_factory=list)
+    actions: list[Any] = field(default_factory=list)
+    rewards: list[Any] = field(default_factory=list)
+    terminated: bool = False
+
+
 class EpisodeRunner:
     """
     Runs episodes of one recording in this process.
+
+    The weights of a large policy (600 kB with 256-256 units) and the state of a simulator drive each other out of the cache of
+    a core. So with such a policy several episodes take their steps in turn, and the weights are read once for all of them.
 
     :param spec: what is to be recorded
     :param policy: the policy that acts, ``None`` to load it
@@ -97,8 +113,10 @@ class EpisodeRunner:
             )
         _check_mode(spec, policy)
         self.policy = policy
-        self.env, limit = _without_bookkeeping(wrapped)
+        env, limit = _without_bookkeeping(wrapped)
+        self._envs = [env]
         self.limit = _limit(spec, limit)
+        self.width = SIDE_BY_SIDE if policy.weight_bytes > _LARGE_BYTES else 1
         self.action_space = action_space
         self._low, self._high = action_space.low, action_space.high
         self._dtype = action_space.dtype
@@ -124,7 +142,9 @@ class EpisodeRunner:
         :param n: episodes
         :return: rows of all of them, in order, and the length of each
         """
-        episodes = [self.run(number) for number in range(first, first + n)]
+        episodes: list[Arrays] = []
+        for start in range(first, first + n, self.width):
+            episodes += self._run_side_by_side(range(start, min(start + self.width, first + n)))
         return concatenate(episodes), [len(episode["rewards"]) for episode in episodes]
 
     def run(self, number: int) -> Arrays:
@@ -135,24 +155,49 @@ class EpisodeRunner:
         :return: observations, actions, rewards (float32), terminals, timeouts (bool) and, if asked for, next_observations
         :raises DatasetSemanticsError: if the simulator returns NaN or infinity
         """
-        noise, added = self._noise(number)
-        act, step, low, high, dtype = self.policy.act, self.env.step, self._low, self._high, self._dtype
-        obs, _ = self.env.reset(seed=self.spec.seed + number)
-        observations, actions, rewards = [], [], []
-        terminated = truncated = False
+        return self._run_side_by_side(range(number, number + 1))[0]
+
+    def _run_side_by_side(self, numbers: range) -> list[Arrays]:
+        """
+        Episodes that take their steps in turn. The policy always sees all of them, those that are over, too: the last bit of
+        a matrix product may depend on the number of its rows.
+        """
+        steps, tracks, starts = [], [_Track() for _ in numbers], []
+        for env, number, track in zip(self._environments(len(numbers)), numbers, tracks, strict=True):
+            first, _ = env.reset(seed=self.spec.seed + number)
+            starts.append(first)
+            track.observations.append(first)
+            steps.append(env.step)
+        obs = np.stack(starts)
+        noise, added = (_stacked(parts) for parts in zip(*(self._noise(number) for number in numbers), strict=True))
+        running = list(range(len(numbers)))
         for t in range(self.limit):
-            action = act(obs[np.newaxis], None if noise is None else noise[t : t + 1], t)[0]
-            if added is not None:
-                action = action + added[t]
-            # float32 before the bounds, which need not be multiples of 1e-4
-            action = np.minimum(np.maximum(action.round(DECIMALS).astype(dtype), low), high)
-            observations.append(obs)
-            actions.append(action)
-            obs, reward, terminated, truncated, _ = step(action)
-            rewards.append(reward)
-            if terminated or truncated:
+            actions = self._act(obs, None if noise is None else noise[t], None if added is None else added[t], t)
+            for i in running[:]:
+                track = tracks[i]
+                seen, reward, terminated, truncated, _ = steps[i](actions[i])
+                track.actions.append(actions[i])
+                track.rewards.append(reward)
+                track.observations.append(seen)
+                obs[i] = seen
+                if terminated or truncated:
+                    track.terminated = bool(terminated)
+                    running.remove(i)
+            if not running:
                 break
-        return self._arrays(number, [*observations, obs], actions, rewards, bool(terminated))
+        return [self._arrays(number, track) for number, track in zip(numbers, tracks, strict=True)]
+
+    def _act(self, obs: np.ndarray, noise: np.ndarray | None, added: np.ndarray | None, t: int) -> np.ndarray:
+        actions = self.policy.act(obs, noise, t)
+        if added is not None:
+            actions = actions + added
+        # float32 before the bounds, which need not be multiples of 1e-4
+        return np.minimum(np.maximum(actions.round(DECIMALS).astype(self._dtype), self._low), self._high)
+
+    def _environments(self, n: int) -> list[gym.Env]:
+        while len(self._envs) < n:
+            self._envs.append(_without_bookkeeping(make_env(self.spec.env))[0])
+        return self._envs[:n]
 
     def _noise(self, number: int) -> tuple[np.ndarray | None, np.ndarray | None]:
         seed = self.spec.seed
@@ -165,19 +210,17 @@ class EpisodeRunner:
         standard = np.random.default_rng([seed, number, 1]).standard_normal((self.limit, len(self._sigma)))
         return noise, self._sigma * standard
 
-    def _arrays(
-        self, number: int, observations: Sequence[Any], actions: Sequence[Any], rewards: Sequence[Any], terminated: bool
-    ) -> Arrays:
-        n = len(rewards)
-        seen = np.asarray(observations, dtype=np.float32)
+    def _arrays(self, number: int, track: _Track) -> Arrays:
+        n = len(track.rewards)
+        seen = np.asarray(track.observations, dtype=np.float32)
         ends = np.zeros(n, dtype=bool)
         ends[-1] = True
         arrays = {
             "observations": seen[:-1],
-            "actions": np.asarray(actions, dtype=np.float32),
-            "rewards": np.asarray(rewards, dtype=np.float32),
-            "terminals": ends & terminated,
-            "timeouts": ends & (not terminated),
+            "actions": np.asarray(track.actions, dtype=np.float32),
+            "rewards": np.asarray(track.rewards, dtype=np.float32),
+            "terminals": ends & track.terminated,
+            "timeouts": ends & (not track.terminated),
         }
         if self.spec.next_observations:
             arrays["next_observations"] = seen[1:]
@@ -240,6 +283,12 @@ def concatenate(parts: Sequence[Arrays]) -> Arrays:
     :return: all rows
     """
     return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+
+
+def _stacked(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
+    """Noise of several episodes, of shape (limit, act_dim) each, step by step: (limit, episodes, act_dim)."""
+    present = [part for part in parts if part is not None]
+    return np.stack(present, axis=1) if present else None
 
 
 def _without_bookkeeping(env: gym.Env) -> tuple[gym.Env, int | None]:

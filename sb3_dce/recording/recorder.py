@@ -326,15 +326,15 @@ def _chunks(runner: EpisodeRunner, first: int, workers: int) -> Generator[tuple[
     """Endless: rows and lengths of the episodes from ``first`` on, in order, some at a time."""
     if workers == 1:
         while True:
-            yield runner.run_many(first, 1)
-            first += 1
-    yield from _parallel_chunks(runner.spec, runner.policy, first, workers)
+            yield runner.run_many(first, runner.width)
+            first += runner.width
+    yield from _parallel_chunks(runner, first, workers)
 
 
-def _parallel_chunks(spec: RecordingSpec, policy: NumpyPolicy, first: int, workers: int) -> Iterator[tuple[Arrays, list[int]]]:
+def _parallel_chunks(runner: EpisodeRunner, first: int, workers: int) -> Iterator[tuple[Arrays, list[int]]]:
     context = mp.get_context("spawn")
-    size, rows, episodes = 1, 0, 0
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_prepare, initargs=(spec, policy))
+    size, rows, episodes = runner.width, 0, 0
+    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_prepare, initargs=(runner.spec, runner.policy))
     pending: deque[Future[tuple[Arrays, list[int]]]] = deque()
     try:
         with _one_thread_each():
@@ -345,7 +345,7 @@ def _parallel_chunks(spec: RecordingSpec, policy: NumpyPolicy, first: int, worke
                     first += size
                 arrays, lengths = pending.popleft().result()
                 rows, episodes = rows + len(arrays["rewards"]), episodes + len(lengths)
-                size = max(1, round(_TASK_ROWS * episodes / rows))
+                size = runner.width * max(1, round(_TASK_ROWS * episodes / rows / runner.width))
                 yield arrays, lengths
     except BrokenProcessPool:
         raise SB3DCEError(
