@@ -27,7 +27,8 @@ from update_tools import (
     to_float64,
 )
 
-from sb3_dce import OfflineCQL, Transitions, ensembles, losses
+from sb3_dce import OfflineCQL, Transitions, ensembles, hyperparams, losses
+from sb3_dce.cql import CQLOptions, _penalties
 from sb3_dce.errors import CheckpointError
 
 BATCH, ACTIONS = 8, 3
@@ -284,8 +285,6 @@ def test_regulariser_does_not_move_the_level_of_q(transitions: Transitions) -> N
 
 
 def test_multiplier_weighs_the_distance_to_the_threshold() -> None:
-    from sb3_dce.cql import CQLOptions, _penalties
-
     # multiplier 1, w = 3, gap 4: w gap - 5 = 7; the other form is 3 (4 - 5) = -3
     coef = {"cql_weight": th.tensor(3.0), "lagrange_threshold": th.tensor(5.0)}
     for form, expected in (("weighted_gap", 7.0), ("gap", -3.0)):
@@ -324,6 +323,20 @@ def test_defaults_are_the_authors(transitions: Transitions) -> None:
     assert rates == {"learning_rate": 3e-4, "actor_learning_rate": 1e-4, "log_ent_coef_learning_rate": 1e-4}
     assert model.noise_specs(256)["uniform"].shape == (10, 256, 2)
     assert [model.update_variant(n)["clone"] for n in (0, 39_999, 40_000)] == [True, True, False]
+
+
+@pytest.mark.parametrize(
+    ("dataset", "weight", "threshold"),
+    [
+        ("walker2d-medium-v2", 10.0, None),
+        ("relocate-human-v0", 1.0, None),
+        ("kitchen-partial-v0", 1.0, None),
+        ("antmaze-medium-play-v0", 5.0, 5.0),
+    ],
+)
+def test_rows_have_the_authors_values(dataset: str, weight: float, threshold: float | None) -> None:
+    row = hyperparams.load_row("offline_cql", dataset)
+    assert (row["cql_weight"], row["lagrange_threshold"], row["policy_eval_start"]) == (weight, threshold, 40_000)
 
 
 def test_optimizers_show_the_rate_of_their_network(transitions: Transitions) -> None:

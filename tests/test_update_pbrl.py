@@ -26,7 +26,7 @@ from update_tools import (
     to_float64,
 )
 
-from sb3_dce import OfflinePBRL, Transitions, ensembles, losses
+from sb3_dce import OfflinePBRL, Transitions, ensembles, hyperparams, losses
 from sb3_dce.errors import ConfigError
 from sb3_dce.population import Population
 
@@ -396,6 +396,28 @@ def test_defaults_are_the_authors(transitions: Transitions) -> None:
     rates = {name: value for name, value in model.coefficients(0).items() if "learning_rate" in name}
     assert rates == {"learning_rate": 3e-4, "actor_learning_rate": 1e-4, "log_ent_coef_learning_rate": 1e-4}
     assert model.noise_specs(256)["ood"].shape == (10, 256, 2)
+
+
+@pytest.mark.parametrize(
+    ("dataset", "eta", "w_s", "w_n", "adaptive"),
+    [
+        ("hopper-random-v2", 0.01, (5.0, 1.0), 0.1, True),
+        ("walker2d-medium-v2", 0.01, (5.0, 1.0), 0.1, True),
+        ("halfcheetah-medium-replay-v2", 0.01, (5.0, 1.0), 0.1, True),
+        ("halfcheetah-medium-expert-v2", 0.01, (5.0, 1.0), 0.1, False),
+        ("hopper-expert-v2", 0.01, (2.0, 2.0), 0.1, False),
+        ("pen-human-v0", 1e-4, (0.001, 0.001), 0.001, False),
+        ("pen-cloned-v0", 1e-4, (0.01, 0.01), 0.01, False),
+        ("pen-expert-v1", 1e-4, (0.4, 0.4), 0.1, False),
+        ("door-expert-v1", 1e-4, (0.2, 0.2), 0.1, False),
+        ("relocate-expert-v1", 1e-4, (0.4, 0.4), 0.2, False),
+    ],
+)
+def test_rows_have_the_authors_values(dataset: str, eta: float, w_s: tuple[float, float], w_n: float, adaptive: bool) -> None:
+    row = hyperparams.load_row("offline_pbrl", dataset)
+    final = row["ood_weight"] if row["ood_weight_final"] is None else row["ood_weight_final"]
+    assert (row["uncertainty_coef"], row["ood_weight"], final, row["ood_weight_next"]) == (eta, *w_s, w_n)
+    assert row["adaptive_ood_weight"] is adaptive
 
 
 @pytest.mark.parametrize("arguments", [{"n_critics": 1}, {"policy_kwargs": {"n_critics": 3}}], ids=str)
