@@ -223,6 +223,7 @@ def test_batched_critics_train_like_critics_one_by_one(transitions: Transitions,
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_compiled_update_equals_the_eager_one(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
     # the batched form, which compiles several times as fast; CQL's test compiles the other one
     monkeypatch.setattr(ensembles, "batched_products_pay", lambda device: True)

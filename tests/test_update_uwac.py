@@ -322,6 +322,7 @@ def compiled_and_eager(transitions: Transitions, policy_eval_start: int) -> tupl
 
 
 @needs_compiler
+@pytest.mark.slow
 def test_compiled_update_equals_the_eager_one(transitions: Transitions) -> None:
     compiled, metrics = compiled_and_eager(transitions, policy_eval_start=0)
     assert len(compiled._engine._compiled) == 1
