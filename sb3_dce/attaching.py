@@ -22,7 +22,6 @@ from sb3_dce.data import Transitions, find_file, load_transitions
 from sb3_dce.data.catalog import DatasetSpec, resolve
 from sb3_dce.data.locate import is_path
 from sb3_dce.data.minari import is_minari_name
-from sb3_dce.data.selection import rows_of_best_episodes
 from sb3_dce.envs import SpacesEnv, dataset_spaces, make_env_if_possible, make_minari_env
 from sb3_dce.errors import ConfigError, DatasetSemanticsError, DatasetWarning
 from sb3_dce.networks import StandardizedExtractor
@@ -41,7 +40,6 @@ class AttachingMixin(OffPolicyAlgorithm):
     reward_normalization: str | None
     reward_scale: float
     reward_shift: float
-    fraction: float = 1.0  # of the whole episodes, the best by return; OfflineBC has it as a parameter
     # Filled at attach, saved with the model: what diagnostics and reward scaling need to know of the data.
     dataset_statistics: dict[str, Any] | None
     _transitions: Transitions | None
@@ -164,7 +162,7 @@ class AttachingMixin(OffPolicyAlgorithm):
                 self._take_statistics_of(buffer)
             return
         transitions = self._load_transitions()
-        buffer.attach(transitions, rows_of_best_episodes(transitions, self.fraction) if self.fraction < 1.0 else None)
+        buffer.attach(transitions, self.chosen_rows(transitions))
         info = transitions.info
         self.dataset_statistics = {
             "rows": buffer.size(),
@@ -179,14 +177,15 @@ class AttachingMixin(OffPolicyAlgorithm):
             self._standardize(buffer.observations)
         self._transitions = None  # the buffer holds the rows now
 
+    def chosen_rows(self, transitions: Transitions) -> np.ndarray | None:
+        """
+        :param transitions: dataset
+        :return: numbers of the rows to train on, ``None`` for all
+        """
+        return None
+
     def _take_statistics_of(self, buffer: OfflineReplayBuffer) -> None:
         """What can be known without the episodes: the range of their returns is not, which reward scaling will say."""
-        if self.fraction < 1.0:
-            raise ConfigError(
-                f"fraction={self.fraction:g} chooses episodes, and a replay buffer does not know where they begin",
-                key="fraction",
-                hint="Pass the data as dataset=, for example Transitions.from_replay_buffer(buffer), or use fraction=1.0.",
-            )
         rewards = buffer.rewards[: buffer.size()]
         self.dataset_statistics = {
             "rows": buffer.size(),

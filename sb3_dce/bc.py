@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
@@ -11,7 +12,11 @@ from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, S
 from sb3_dce import losses
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
+from sb3_dce.buffers import OfflineReplayBuffer
 from sb3_dce.checks import check_choice, check_number, check_optional
+from sb3_dce.data.selection import rows_of_best_episodes
+from sb3_dce.data.transitions import Transitions
+from sb3_dce.errors import ConfigError
 from sb3_dce.execution import Update
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import ActorPolicy
@@ -91,6 +96,18 @@ class OfflineBC(OfflineAlgorithm):
         check_choice("bc_loss", self.bc_loss, ("mse", "nll"))
         check_number("fraction", self.fraction, 0, 1, open_low=True, hint="0.1 clones the best tenth of the episodes.")
         check_optional("max_grad_norm", self.max_grad_norm)
+
+    def chosen_rows(self, transitions: Transitions) -> np.ndarray | None:
+        return rows_of_best_episodes(transitions, self.fraction) if self.fraction < 1.0 else None
+
+    def _take_statistics_of(self, buffer: OfflineReplayBuffer) -> None:
+        if self.fraction < 1.0:
+            raise ConfigError(
+                f"fraction={self.fraction:g} chooses episodes, and a replay buffer does not know where they begin",
+                key="fraction",
+                hint="Pass the data as dataset=, for example Transitions.from_replay_buffer(buffer), or use fraction=1.0.",
+            )
+        super()._take_statistics_of(buffer)
 
     def make_update(self, storages: dict[str, Storage]) -> Update:
         net, settings = PureNet(self.actor, "get_action_dist_params"), storages["actor"].settings

@@ -12,6 +12,7 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
 
 from sb3_dce import losses
+from sb3_dce.actor_rate import ActorLearningRate
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.checks import check_choice, check_number, check_optional
@@ -22,7 +23,7 @@ from sb3_dce.networks import OfflineCritic
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import OfflineSACPolicy
 from sb3_dce.state import PureNet, Storage
-from sb3_dce.steps import descend, polyak
+from sb3_dce.steps import descend, polyak, q_data_metrics
 
 LAGRANGE = "log_lagrange"  # name of the multiplier's learner in the state tree
 LAGRANGE_FORMS = ("weighted_gap", "gap")
@@ -42,7 +43,7 @@ class CQLOptions:
     max_grad_norm: float | None
 
 
-class OfflineCQL(EntropyCoefficient, OfflineAlgorithm):
+class OfflineCQL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
     """
     Conservative Q-learning: SAC's critics with ``w * (log sum_a' exp Q(s, a') - Q(s, a))`` added to their loss.
 
@@ -75,7 +76,7 @@ class OfflineCQL(EntropyCoefficient, OfflineAlgorithm):
     algo_name: ClassVar[str] = "offline_cql"
     networks = ("actor", "critic", "critic_target")
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": OfflineSACPolicy}
-    population_scalars = frozenset({"actor_learning_rate", "cql_weight", "lagrange_threshold"})
+    population_scalars = frozenset({"cql_weight", "lagrange_threshold"})
     policy: OfflineSACPolicy
     critic: OfflineCritic
     critic_target: OfflineCritic
@@ -160,7 +161,6 @@ class OfflineCQL(EntropyCoefficient, OfflineAlgorithm):
 
     def check_parameters(self) -> None:
         super().check_parameters()
-        check_optional("actor_learning_rate", self.actor_learning_rate, hint="None takes learning_rate.")
         check_number("cql_weight", self.cql_weight, 0, hint="The authors use 5 or 10; 1 with a Lagrange multiplier.")
         check_number("n_actions", self.n_actions, 1, integer=True)
         if self.lagrange_threshold is not None:
@@ -231,8 +231,7 @@ class OfflineCQL(EntropyCoefficient, OfflineAlgorithm):
 
     def learning_rates(self) -> dict[str, float]:
         rates = super().learning_rates()
-        rate = rates["learning_rate"] if self.actor_learning_rate is None else self.actor_learning_rate
-        return {**rates, "actor_learning_rate": rate, "log_ent_coef_learning_rate": rate}
+        return {**rates, "log_ent_coef_learning_rate": rates["actor_learning_rate"]}
 
     def coefficients(self, n_updates: int) -> dict[str, float]:
         coefficients = {**super().coefficients(n_updates), "cql_weight": self.cql_weight}
@@ -282,7 +281,9 @@ def update(
     a_pi, log_prob = losses.squashed_gaussian(mean, log_std, noise["actor"])
     ent_coef = coef.get("ent_coef")
     if options.learned_ent_coef:
-        new[ENT_COEF], metrics["ent_coef_loss"] = descend_ent_coef(state[ENT_COEF], log_prob, coef, settings[ENT_COEF])
+        new[ENT_COEF], metrics["ent_coef_loss"] = descend_ent_coef(
+            state[ENT_COEF], log_prob, coef["target_entropy"], coef["log_ent_coef_learning_rate"], settings[ENT_COEF]
+        )
         ent_coef = new[ENT_COEF].params.exp()
     assert ent_coef is not None
 
@@ -372,10 +373,7 @@ def _critic_metrics(q_data: th.Tensor, q_sampled: th.Tensor, y: th.Tensor) -> di
     q_uniform, q_next, q_policy = q_sampled.chunk(3, dim=-3)
     return {
         **{f"q{i}_data": q.mean() for i, q in enumerate(q_data)},
-        "q_data": q_data.mean(),
-        "q_data_std": q_data.std(),
-        "q_data_min": q_data.min(),
-        "q_data_max": q_data.max(),
+        **q_data_metrics(q_data),
         "q_policy": q_policy.mean(),
         "q_next_policy": q_next.mean(),
         "q_uniform": q_uniform.mean(),

@@ -14,7 +14,7 @@ from sb3_dce import losses
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.checks import check_choice, check_number, check_optional
-from sb3_dce.entropy import ENT_COEF, EntropyCoefficient
+from sb3_dce.entropy import ENT_COEF, EntropyCoefficient, descend_ent_coef
 from sb3_dce.errors import ConfigError
 from sb3_dce.execution import Update
 from sb3_dce.networks import OfflineCritic, ValueNet
@@ -22,7 +22,7 @@ from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import OfflineSACPolicy
 from sb3_dce.schedules import StepSchedule
 from sb3_dce.state import PureNet, Storage
-from sb3_dce.steps import descend, polyak
+from sb3_dce.steps import descend, polyak, q_data_metrics
 from sb3_dce.theory import beta_eff, shift_factor
 
 PENALTY_SOURCES = ("policy", "policy_deterministic", "next_policy", "dataset", "uniform")
@@ -455,11 +455,9 @@ def update(
     new["actor"], loss, log_prob, norm = descend(pi_loss, state["actor"], lr, settings["actor"], clip)
     metrics.update(actor_loss=loss, grad_norm_actor=norm, entropy=-log_prob.mean(), ent_coef=ent_coef.mean())
     if options.learned_ent_coef:
-
-        def alpha_loss(log_ent_coef: th.Tensor) -> tuple[th.Tensor, tuple[()]]:
-            return losses.ent_coef_loss(log_ent_coef, log_prob, coef["target_entropy"]), ()
-
-        new[ENT_COEF], metrics["ent_coef_loss"], _, _ = descend(alpha_loss, state[ENT_COEF], lr, settings[ENT_COEF])
+        new[ENT_COEF], metrics["ent_coef_loss"] = descend_ent_coef(
+            state[ENT_COEF], log_prob, coef["target_entropy"], lr, settings[ENT_COEF]
+        )
     return new, metrics
 
 
@@ -542,10 +540,7 @@ def _critic_metrics(
     per_critic = {f"q{i}_data": q.mean() for i, q in enumerate(q_data)}
     return {
         **per_critic,
-        "q_data": data.mean(),
-        "q_data_std": data.std(),
-        "q_data_min": data.min(),
-        "q_data_max": data.max(),
+        **q_data_metrics(data),
         "q_policy": penalised.mean(),
         "q_gap": penalised.mean() - data.mean(),
         "td_mse": (data - y).square().mean(),

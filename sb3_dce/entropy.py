@@ -107,20 +107,21 @@ class EntropyCoefficient:
 
 
 def descend_ent_coef(
-    learner: Learner, log_prob: th.Tensor, coef: dict[str, th.Tensor], settings: AdamSettings
+    learner: Learner, log_prob: th.Tensor, target_entropy: th.Tensor, learning_rate: th.Tensor, settings: AdamSettings
 ) -> tuple[Learner, th.Tensor]:
     """
     One step of the temperature.
 
     :param learner: the learner ``log_ent_coef`` before the step
     :param log_prob: log-probabilities of the policy's actions, shape (batch, 1), nats
-    :param coef: ``target_entropy`` and ``log_ent_coef_learning_rate``
+    :param target_entropy: wished entropy, 0-dimensional, nats
+    :param learning_rate: 0-dimensional
     :param settings: constants of the optimizer
     :return: learner after the step, loss
     """
 
     def loss(log_ent_coef: th.Tensor) -> tuple[th.Tensor, tuple[()]]:
-        return losses.ent_coef_loss(log_ent_coef, log_prob, coef["target_entropy"]), ()
+        return losses.ent_coef_loss(log_ent_coef, log_prob, target_entropy), ()
 
-    learner, value, _, _ = descend(loss, learner, coef["log_ent_coef_learning_rate"], settings)
+    learner, value, _, _ = descend(loss, learner, learning_rate, settings)
     return learner, value

@@ -20,7 +20,7 @@ from sb3_dce.networks import OfflineCritic, ValueNet
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import OfflineIQLPolicy
 from sb3_dce.state import PureNet, Storage
-from sb3_dce.steps import descend, polyak
+from sb3_dce.steps import descend, polyak, q_data_metrics
 
 # Actions of the data are kept this far inside of [-1, 1], as the authors' loader does.
 ACTION_LIMIT = 1.0 - 1e-5
@@ -248,7 +248,7 @@ def update(
 
     new["critic"], loss, q_data, norm = descend(q_loss, state["critic"], lr, settings["critic"], clip)
     metrics.update(critic_loss=loss, grad_norm_q=norm, td_target=y.mean(), value_next=next_values.mean())
-    metrics.update(q_data=q_data.mean(), q_data_std=q_data.std(), q_data_min=q_data.min(), q_data_max=q_data.max())
+    metrics.update(q_data_metrics(q_data))
     metrics["td_mse"] = (q_data - y).square().mean()
 
     # 4 targets

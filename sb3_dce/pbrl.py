@@ -12,6 +12,7 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
 
 from sb3_dce import losses
+from sb3_dce.actor_rate import ActorLearningRate
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.checks import check_number, check_optional
@@ -22,7 +23,7 @@ from sb3_dce.execution import Update
 from sb3_dce.networks import OfflineCritic
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.state import PureNet, Storage
-from sb3_dce.steps import descend, polyak
+from sb3_dce.steps import descend, polyak, q_data_metrics
 
 OOD_Q = "ood_q"  # name of the recorded value in the state tree
 # The adaptive weight compares the mean of the last 5 recorded values with that of the 15 before (authors' code).
@@ -40,7 +41,7 @@ class PBRLOptions:
     max_grad_norm: float | None
 
 
-class OfflinePBRL(EntropyCoefficient, OfflineAlgorithm):
+class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
     """
     Pessimistic bootstrapping: ten critics, each with its own target, whose disagreement u(s, a) is subtracted.
 
@@ -82,7 +83,7 @@ class OfflinePBRL(EntropyCoefficient, OfflineAlgorithm):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": EnsemblePolicy}
     population_scalars = frozenset(
         {
-            *("actor_learning_rate", "uncertainty_coef", "ood_weight", "ood_weight_final", "ood_weight_steps"),
+            *("uncertainty_coef", "ood_weight", "ood_weight_final", "ood_weight_steps"),
             *("ood_weight_next", "ood_weight_decay", "ood_weight_min"),
         }
     )
@@ -184,7 +185,6 @@ class OfflinePBRL(EntropyCoefficient, OfflineAlgorithm):
 
     def check_parameters(self) -> None:
         super().check_parameters()
-        check_optional("actor_learning_rate", self.actor_learning_rate, hint="None takes learning_rate.")
         check_number("n_critics", self.n_critics, 2, integer=True, hint="One critic cannot disagree; the authors use 10.")
         if "n_critics" in self.policy_kwargs:
             raise ConfigError(
@@ -264,8 +264,7 @@ class OfflinePBRL(EntropyCoefficient, OfflineAlgorithm):
 
     def learning_rates(self) -> dict[str, float]:
         rates = super().learning_rates()
-        rate = rates["learning_rate"] if self.actor_learning_rate is None else self.actor_learning_rate
-        return {**rates, "actor_learning_rate": rate, "log_ent_coef_learning_rate": rate}
+        return {**rates, "log_ent_coef_learning_rate": rates["actor_learning_rate"]}
 
     def coefficients(self, n_updates: int) -> dict[str, float]:
         return {
@@ -345,7 +344,9 @@ def update(
     a_pi, log_prob = losses.squashed_gaussian(mean, log_std, noise["actor"])
     ent_coef = coef.get("ent_coef")
     if options.learned_ent_coef:
-        new[ENT_COEF], metrics["ent_coef_loss"] = descend_ent_coef(state[ENT_COEF], log_prob, coef, settings[ENT_COEF])
+        new[ENT_COEF], metrics["ent_coef_loss"] = descend_ent_coef(
+            state[ENT_COEF], log_prob, coef["target_entropy"], coef["log_ent_coef_learning_rate"], settings[ENT_COEF]
+        )
         ent_coef = new[ENT_COEF].params.exp()
     assert ent_coef is not None
 
@@ -414,10 +415,7 @@ def _critic_metrics(q_data: th.Tensor, q_ood: th.Tensor, n_ood: int) -> dict[str
     """Diagnostics of the critics before their step."""
     q_policy = q_ood[..., :n_ood, :].mean()
     return {
-        "q_data": q_data.mean(),
-        "q_data_std": q_data.std(),
-        "q_data_min": q_data.min(),
-        "q_data_max": q_data.max(),
+        **q_data_metrics(q_data),
         "q_policy": q_policy,
         "q_next_policy": q_ood[..., n_ood:, :].mean(),
         "q_gap": q_policy - q_data.mean(),

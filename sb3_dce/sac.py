@@ -13,13 +13,13 @@ from sb3_dce import losses
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.checks import check_optional
-from sb3_dce.entropy import ENT_COEF, EntropyCoefficient
+from sb3_dce.entropy import ENT_COEF, EntropyCoefficient, descend_ent_coef
 from sb3_dce.execution import Update
 from sb3_dce.networks import OfflineCritic
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import OfflineSACPolicy
 from sb3_dce.state import PureNet, Storage
-from sb3_dce.steps import descend, polyak
+from sb3_dce.steps import descend, polyak, q_data_metrics
 
 
 class OfflineSAC(EntropyCoefficient, OfflineAlgorithm):
@@ -167,7 +167,7 @@ def update(
 
     new["critic"], loss, q_data, norm = descend(q_loss, state["critic"], lr, settings["critic"], max_grad_norm)
     metrics = {"critic_loss": loss, "grad_norm_q": norm, "td_target": y.mean(), "value_next": next_values.mean()}
-    metrics.update(q_data=q_data.mean(), q_data_std=q_data.std(), q_data_min=q_data.min(), q_data_max=q_data.max())
+    metrics.update(q_data_metrics(q_data))
     metrics["td_mse"] = (q_data - y).square().mean()
 
     # 3 actor on the new critics
@@ -185,11 +185,9 @@ def update(
 
     # 4 temperature, from the log-probability of the policy before its step
     if learned:
-
-        def alpha_loss(log_ent_coef: th.Tensor) -> tuple[th.Tensor, tuple[()]]:
-            return losses.ent_coef_loss(log_ent_coef, log_prob, coef["target_entropy"]), ()
-
-        new[ENT_COEF], metrics["ent_coef_loss"], _, _ = descend(alpha_loss, state[ENT_COEF], lr, settings[ENT_COEF])
+        new[ENT_COEF], metrics["ent_coef_loss"] = descend_ent_coef(
+            state[ENT_COEF], log_prob, coef["target_entropy"], lr, settings[ENT_COEF]
+        )
 
     # 5 targets
     new["critic_target"] = polyak(new["critic"].params, state["critic_target"], coef["tau"])

@@ -184,10 +184,3 @@ class TrainState:
         :return: name -> learner or flat vector
         """
         return {name: storage.read() for name, storage in self.storages.items()}
-
-    def write(self, new: dict[str, Any]) -> None:
-        """
-        :param new: as returned by :meth:`read`; names left out stay as they are
-        """
-        for name, value in new.items():
-            self.storages[name].write(value)

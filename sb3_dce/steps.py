@@ -65,3 +65,12 @@ def polyak(params: th.Tensor, target_params: th.Tensor, tau: th.Tensor) -> th.Te
     :return: new target parameters
     """
     return target_params + tau * (params - target_params)
+
+
+def q_data_metrics(q_values: th.Tensor) -> dict[str, th.Tensor]:
+    """
+    :param q_values: Q of all critics on the data, any shape, reward units
+    :return: the diagnostics every agent with critics logs of them
+    """
+    names = ("q_data", "q_data_std", "q_data_min", "q_data_max")
+    return dict(zip(names, (q_values.mean(), q_values.std(), q_values.min(), q_values.max()), strict=True))

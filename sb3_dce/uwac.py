@@ -11,13 +11,14 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
 
 from sb3_dce import losses
+from sb3_dce.actor_rate import ActorLearningRate
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.checks import check_choice, check_number, check_optional
 from sb3_dce.execution import Update
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.state import PureNet, Storage
-from sb3_dce.steps import descend, polyak
+from sb3_dce.steps import descend, polyak, q_data_metrics
 from sb3_dce.uwac_networks import ActionVAE, DropoutCritic
 from sb3_dce.uwac_policy import UWACPolicy
 
@@ -40,7 +41,7 @@ class UWACOptions:
     max_grad_norm: float | None
 
 
-class OfflineUWAC(OfflineAlgorithm):
+class OfflineUWAC(ActorLearningRate, OfflineAlgorithm):
     """
     Uncertainty-weighted actor-critic: targets of uncertain next actions count less.
 
@@ -83,7 +84,7 @@ class OfflineUWAC(OfflineAlgorithm):
     algo_name: ClassVar[str] = "offline_uwac"
     networks = ("actor", "critic", "critic_target", "vae")
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": UWACPolicy}
-    population_scalars = frozenset({"actor_learning_rate", "alpha_learning_rate", "uwac_beta", "mmd_sigma", "mmd_threshold"})
+    population_scalars = frozenset({"alpha_learning_rate", "uwac_beta", "mmd_sigma", "mmd_threshold"})
     policy: UWACPolicy
     critic: DropoutCritic
     critic_target: DropoutCritic
@@ -177,7 +178,6 @@ class OfflineUWAC(OfflineAlgorithm):
 
     def check_parameters(self) -> None:
         super().check_parameters()
-        check_optional("actor_learning_rate", self.actor_learning_rate, hint="None takes learning_rate.")
         check_number("alpha_learning_rate", self.alpha_learning_rate, 0)
         check_number("n_mc_dropout", self.n_mc_dropout, 2, integer=True, hint="A variance needs two; the authors use 100.")
         check_number("critic_dropout", self.critic_dropout, 0, 1, open_high=True, hint="The authors use 0.1.")
@@ -270,8 +270,7 @@ class OfflineUWAC(OfflineAlgorithm):
 
     def learning_rates(self) -> dict[str, float]:
         rates = super().learning_rates()
-        rate = rates["learning_rate"] if self.actor_learning_rate is None else self.actor_learning_rate
-        return {**rates, "actor_learning_rate": rate, "log_alpha_learning_rate": self.alpha_learning_rate}
+        return {**rates, "log_alpha_learning_rate": self.alpha_learning_rate}
 
     def coefficients(self, n_updates: int) -> dict[str, float]:
         return {
@@ -346,7 +345,7 @@ def update(
 
     new["critic"], loss, q_data, norm = descend(q_loss, state["critic"], lr, settings["critic"], clip)
     metrics.update(critic_loss=loss, grad_norm_q=norm, td_mse=(q_data - y).square().mean())
-    metrics.update(q_data=q_data.mean(), q_data_std=q_data.std(), q_data_min=q_data.min(), q_data_max=q_data.max())
+    metrics.update(q_data_metrics(q_data))
     metrics["twin_gap"] = (q_data.amax(dim=0) - q_data.amin(dim=0)).mean()
 
     # 4 actor; the first of its actions is valued

@@ -1,0 +1,29 @@
+"""A learning rate of the actor's own, as several of the baselines have it."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from sb3_dce.checks import check_optional
+
+
+class ActorLearningRate:
+    """Mixin of agents with the parameter ``actor_learning_rate``; ``None`` is the rate of the other networks."""
+
+    population_scalars: ClassVar[frozenset[str]] = frozenset({"actor_learning_rate"})
+    actor_learning_rate: float | None
+
+    def check_parameters(self) -> None:
+        """
+        :raises ConfigError: if a parameter is out of its range
+        """
+        super().check_parameters()  # type: ignore[misc]
+        check_optional("actor_learning_rate", self.actor_learning_rate, hint="None takes learning_rate.")
+
+    def learning_rates(self) -> dict[str, float]:
+        """
+        :return: learning rates of the next update by coefficient, ``actor_learning_rate`` among them
+        """
+        rates: dict[str, float] = super().learning_rates()  # type: ignore[misc]
+        own = self.actor_learning_rate
+        return {**rates, "actor_learning_rate": rates["learning_rate"] if own is None else own}
