@@ -18,6 +18,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import load_env_creator
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from gymnasium.wrappers.utils import create_zero_array
 
 from sb3_dce.data import catalog
@@ -195,6 +196,22 @@ def missing_simulator(spec: DatasetSpec) -> MissingSimulator | None:
             remedy = f"Install it with: {INSTALL_COMMANDS[package]}"
             return MissingSimulator(f"the environment of {spec.id!r} needs the package {package!r}", remedy, package)
     return None
+
+
+def without_bookkeeping(env: gym.Env) -> tuple[gym.Env, int | None]:
+    """
+    The environment below Gymnasium's own bookkeeping, whose checks cost time in every step. Other wrappers, which may change
+    what is observed or paid, stay.
+
+    :param env: environment
+    :return: the environment below, and the time limit that has to be kept by the caller, steps; ``None`` without one
+    """
+    limit = None
+    while isinstance(env, TimeLimit | OrderEnforcing | PassiveEnvChecker):
+        if isinstance(env, TimeLimit):
+            limit = min(limit or env._max_episode_steps, env._max_episode_steps)
+        env = env.env
+    return env, limit
 
 
 def dataset_spaces(spec: DatasetSpec) -> tuple[spaces.Box, spaces.Box]:

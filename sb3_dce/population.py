@@ -23,6 +23,7 @@ from sb3_dce.buffers import OfflineReplayBuffer
 from sb3_dce.errors import ConfigError
 from sb3_dce.execution import Engine, choose_execution
 from sb3_dce.networks import StandardizedExtractor
+from sb3_dce.noise import NoiseSpec
 from sb3_dce.optimizers import Learner
 from sb3_dce.precision import matmul_precision
 from sb3_dce.state import Storage
@@ -127,9 +128,10 @@ class Population:
         for model in self.models:
             model.policy.set_training_mode(True)
         engine = self._bound_engine(total)
+        specs = first.noise_specs(first.batch_size)
         with matmul_precision(first.precision, self.device):
             for _ in range(n_updates):
-                indices, noise = self._draw(first.batch_size)
+                indices, noise = self._draw(specs, first.batch_size)
                 engine.step(self._gather(indices), noise, self._coefficients(total), **first.update_variant(self._n_updates))
                 self._n_updates += 1
                 if first.reads_state_after(self._n_updates):
@@ -154,9 +156,8 @@ class Population:
             self._engine = Engine(together, self.state, execution)
         return self._engine
 
-    def _draw(self, batch_size: int) -> tuple[th.Tensor, dict[str, th.Tensor]]:
+    def _draw(self, specs: dict[str, NoiseSpec], batch_size: int) -> tuple[th.Tensor, dict[str, th.Tensor]]:
         """Row numbers, shape (models, batch), and noise with a leading model dimension."""
-        specs = self.models[0].noise_specs(batch_size)
         if not self.own_randomness:
             # The bias of the remainder is below 1e-11.
             numbers = th.randint(2**62, (len(self), batch_size), generator=self._generator, device=self.device)

@@ -13,12 +13,11 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import torch as th
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_dce.checks import check_number
+from sb3_dce.envs import without_bookkeeping
 
 Act = Callable[[np.ndarray], np.ndarray]
 
@@ -46,7 +45,7 @@ class Rollouts:
 
     def __init__(self, make_env: Callable[[], gym.Env], n_episodes: int) -> None:
         check_number("n_eval_episodes", n_episodes, 1, integer=True, hint="Usual are 10.")
-        self._envs = [_without_wrappers(make_env()) for _ in range(n_episodes)]
+        self._envs = [without_bookkeeping(make_env()) for _ in range(n_episodes)]
 
     def play(self, act: Act, seed: int) -> Episodes:
         """
@@ -69,7 +68,7 @@ class Rollouts:
                 env, limit = self._envs[i]
                 obs[i], reward, terminated, truncated, _ = env.step(actions[i])
                 rewards[i].append(float(reward))
-                if not (terminated or truncated or len(rewards[i]) >= limit):
+                if not (terminated or truncated or len(rewards[i]) == limit):
                     still.append(i)
                     continue
                 returns.append(round(sum(rewards[i]), 6))  # the sum and the rounding of Stable-Baselines3's Monitor
@@ -81,16 +80,6 @@ class Rollouts:
         """Close the environments."""
         for env, _ in self._envs:
             env.close()
-
-
-def _without_wrappers(env: gym.Env) -> tuple[gym.Env, float]:
-    """The environment under wrappers that only count or check, and its time limit in steps."""
-    limit = float("inf")
-    while isinstance(env, TimeLimit | OrderEnforcing | PassiveEnvChecker | Monitor):
-        if isinstance(env, TimeLimit):
-            limit = min(limit, env._max_episode_steps)
-        env = env.env
-    return env, limit
 
 
 def deterministic_act(model: Any) -> Act:

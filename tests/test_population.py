@@ -110,7 +110,7 @@ def test_observations_are_standardised_by_each_members_own_data(data: list[Trans
 def test_common_draws_reach_every_row_of_every_members_data(data: list[Transitions]) -> None:
     members = [make(rows, seed=s, batch_size=2000) for s, rows in enumerate(data)]
     population = Population(members)
-    indices, noise = population._draw(2000)
+    indices, noise = population._draw(members[0].noise_specs(2000), 2000)
     assert [int(row.max()) for row in indices] == [89, 53] and [len(row.unique()) for row in indices] == [90, 54]
     assert noise["actor"].shape == (2, 2000, 2) and not th.equal(noise["actor"][0], noise["actor"][1])
     batch = population._gather(indices)

@@ -18,10 +18,9 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 
 from sb3_dce.data.catalog import DatasetSpec, all_specs, resolve
-from sb3_dce.envs import make_env_if_possible, missing_simulator
+from sb3_dce.envs import make_env_if_possible, missing_simulator, without_bookkeeping
 from sb3_dce.errors import ConfigError, DatasetError, DatasetSemanticsError
 from sb3_dce.numpy_policy import NumpyPolicy
 from sb3_dce.recording.policy_files import PolicyFacts, load_policy
@@ -113,7 +112,7 @@ class EpisodeRunner:
             )
         _check_mode(spec, policy)
         self.policy = policy
-        env, limit = _without_bookkeeping(wrapped)
+        env, limit = without_bookkeeping(wrapped)
         self._envs = [env]
         self.limit = _limit(spec, limit)
         self.width = SIDE_BY_SIDE if policy.weight_bytes > _LARGE_BYTES else 1
@@ -196,7 +195,7 @@ class EpisodeRunner:
 
     def _environments(self, n: int) -> list[gym.Env]:
         while len(self._envs) < n:
-            self._envs.append(_without_bookkeeping(make_env(self.spec.env))[0])
+            self._envs.append(without_bookkeeping(make_env(self.spec.env))[0])
         return self._envs[:n]
 
     def _noise(self, number: int) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -289,20 +288,6 @@ def _stacked(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
     """Noise of several episodes, of shape (limit, act_dim) each, step by step: (limit, episodes, act_dim)."""
     present = [part for part in parts if part is not None]
     return np.stack(present, axis=1) if present else None
-
-
-def _without_bookkeeping(env: gym.Env) -> tuple[gym.Env, int | None]:
-    """
-    The environment below Gymnasium's own bookkeeping, whose checks cost time in every step, and the time limit.
-
-    Other wrappers, which may change what is observed or paid, stay.
-    """
-    limit = None
-    while isinstance(env, TimeLimit | OrderEnforcing | PassiveEnvChecker):
-        if isinstance(env, TimeLimit):
-            limit = min(limit or env._max_episode_steps, env._max_episode_steps)
-        env = env.env
-    return env, limit
 
 
 def _limit(spec: RecordingSpec, limit: int | None) -> int:
