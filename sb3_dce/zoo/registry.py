@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
@@ -13,52 +13,12 @@ if TYPE_CHECKING:
     import optuna
 
 
-def sample_dce_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
+Params = dict[str, Any]
+
+
+def convert_bc_params(sampled_params: Params) -> Params:
     """
-    Draw hyperparameters of DCE; the penalty weight is searched as a constant.
-
-    A trial is judged by evaluation in the simulator, so that what is found is tuned *online*: say so with results.
-
-    :param trial: trial of the search
-    :param n_actions: unused, as the other arguments of rl_zoo3
-    :param n_envs: unused
-    :param additional_args: unused
-    :return: constructor keywords
-    """
-    return convert_dce_params(
-        {
-            **_sample_optimizer(trial),
-            **_sample_bootstrap(trial),
-            "beta": trial.suggest_float("beta", 0.03, 30.0, log=True),
-            "expectile": trial.suggest_float("expectile", 0.5, 0.95),
-        }
-    )
-
-
-def convert_dce_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
-    """
-    :param sampled_params: parameters of a trial, as drawn by :func:`sample_dce_params`
-    :return: constructor keywords; a schedule in the row is switched off, since it belongs to another start value
-    """
-    return {**convert_critic_params(sampled_params), "beta_final": None, "beta_rate": 0.0}
-
-
-def sample_bc_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
-    """
-    Draw hyperparameters of behavioural cloning; see :func:`sample_dce_params`.
-
-    :param trial: trial of the search
-    :param n_actions: unused
-    :param n_envs: unused
-    :param additional_args: unused
-    :return: constructor keywords
-    """
-    return convert_bc_params(_sample_optimizer(trial))
-
-
-def convert_bc_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
-    """
-    :param sampled_params: parameters of a trial, as drawn by :func:`sample_bc_params`
+    :param sampled_params: parameters of a trial
     :return: constructor keywords
     """
     params = dict(sampled_params)
@@ -66,160 +26,7 @@ def convert_bc_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     return params
 
 
-def sample_td3bc_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
-    """
-    Draw hyperparameters of TD3+BC; see :func:`sample_dce_params`.
-
-    :param trial: trial of the search
-    :param n_actions: unused
-    :param n_envs: unused
-    :param additional_args: unused
-    :return: constructor keywords
-    """
-    drawn = {
-        **_sample_optimizer(trial),
-        **_sample_bootstrap(trial),
-        "alpha": trial.suggest_float("alpha", 0.1, 20.0, log=True),
-    }
-    return convert_critic_params(drawn)
-
-
-def sample_iql_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
-    """
-    Draw hyperparameters of IQL; see :func:`sample_dce_params`.
-
-    :param trial: trial of the search
-    :param n_actions: unused
-    :param n_envs: unused
-    :param additional_args: unused
-    :return: constructor keywords
-    """
-    return convert_critic_params(
-        {
-            **_sample_optimizer(trial),
-            **_sample_bootstrap(trial),
-            "expectile": trial.suggest_float("expectile", 0.5, 0.95),
-            "temperature": trial.suggest_float("temperature", 0.1, 20.0, log=True),
-            "actor_dropout": trial.suggest_float("actor_dropout", 0.0, 0.3),
-        }
-    )
-
-
-def sample_sac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
-    """
-    Draw hyperparameters of SAC on a dataset; see :func:`sample_dce_params`.
-
-    :param trial: trial of the search
-    :param n_actions: unused
-    :param n_envs: unused
-    :param additional_args: unused
-    :return: constructor keywords
-    """
-    return convert_critic_params({**_sample_optimizer(trial), **_sample_bootstrap(trial)})
-
-
-def sample_sac_v_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
-    """
-    Draw hyperparameters of SAC with V; see :func:`sample_dce_params`.
-
-    :param trial: trial of the search
-    :param n_actions: unused
-    :param n_envs: unused
-    :param additional_args: unused
-    :return: constructor keywords
-    """
-    drawn = {**_sample_optimizer(trial), **_sample_bootstrap(trial)}
-    return convert_critic_params({**drawn, "expectile": trial.suggest_float("expectile", 0.5, 0.95)})
-
-
-def sample_cql_eq18_params(
-    trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]
-) -> dict[str, Any]:
-    """
-    Draw hyperparameters of the paper's Eq. 18 agent; see :func:`sample_dce_params`.
-
-    :param trial: trial of the search
-    :param n_actions: unused
-    :param n_envs: unused
-    :param additional_args: unused
-    :return: constructor keywords
-    """
-    drawn = {**_sample_optimizer(trial), **_sample_bootstrap(trial)}
-    return convert_critic_params({**drawn, "beta": trial.suggest_float("beta", 0.03, 30.0, log=True)})
-
-
-def sample_uwac_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
-    """
-    Draw hyperparameters of UWAC; see :func:`sample_dce_params`.
-
-    :param trial: trial of the search
-    :param n_actions: unused
-    :param n_envs: unused
-    :param additional_args: unused
-    :return: constructor keywords
-    """
-    return convert_critic_params(
-        {
-            **_sample_optimizer(trial),
-            **_sample_bootstrap(trial),
-            "uwac_beta": trial.suggest_float("uwac_beta", 0.01, 10.0, log=True),
-            "critic_dropout": trial.suggest_float("critic_dropout", 0.05, 0.3),
-            "mmd_threshold": trial.suggest_float("mmd_threshold", 0.01, 0.3, log=True),
-        }
-    )
-
-
-def sample_cql_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
-    """
-    Draw hyperparameters of CQL; see :func:`sample_dce_params`.
-
-    :param trial: trial of the search
-    :param n_actions: unused
-    :param n_envs: unused
-    :param additional_args: unused
-    :return: constructor keywords
-    """
-    return convert_critic_params(
-        {
-            **_sample_optimizer(trial),
-            **_sample_bootstrap(trial),
-            "actor_learning_rate": trial.suggest_float("actor_learning_rate", 1e-5, 1e-3, log=True),
-            "cql_weight": trial.suggest_float("cql_weight", 0.1, 20.0, log=True),
-        }
-    )
-
-
-def sample_pbrl_params(trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: dict[str, Any]) -> dict[str, Any]:
-    """
-    Draw hyperparameters of PBRL; the weight at s is searched as a constant. See :func:`sample_dce_params`.
-
-    :param trial: trial of the search
-    :param n_actions: unused
-    :param n_envs: unused
-    :param additional_args: unused
-    :return: constructor keywords
-    """
-    return convert_pbrl_params(
-        {
-            **_sample_optimizer(trial),
-            **_sample_bootstrap(trial),
-            "actor_learning_rate": trial.suggest_float("actor_learning_rate", 1e-5, 1e-3, log=True),
-            "uncertainty_coef": trial.suggest_float("uncertainty_coef", 1e-5, 0.1, log=True),
-            "ood_weight": trial.suggest_float("ood_weight", 1e-3, 5.0, log=True),
-            "ood_weight_next": trial.suggest_float("ood_weight_next", 1e-3, 1.0, log=True),
-        }
-    )
-
-
-def convert_pbrl_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
-    """
-    :param sampled_params: parameters of a trial, as drawn by :func:`sample_pbrl_params`
-    :return: constructor keywords; a schedule in the row is switched off, since it belongs to another start value
-    """
-    return {**convert_critic_params(sampled_params), "ood_weight_final": None, "adaptive_ood_weight": False}
-
-
-def convert_critic_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
+def convert_critic_params(sampled_params: Params) -> Params:
     """
     :param sampled_params: parameters of a trial of an agent with critics
     :return: constructor keywords
@@ -229,44 +36,121 @@ def convert_critic_params(sampled_params: dict[str, Any]) -> dict[str, Any]:
     return params
 
 
-def _sample_bootstrap(trial: optuna.Trial) -> dict[str, Any]:
-    return {
-        "one_minus_gamma": trial.suggest_float("one_minus_gamma", 1e-3, 3e-2, log=True),
-        "tau": trial.suggest_float("tau", 1e-3, 2e-2, log=True),
-    }
+def convert_dce_params(sampled_params: Params) -> Params:
+    """
+    :param sampled_params: parameters of a trial of DCE
+    :return: constructor keywords; a schedule in the row is switched off, since it belongs to another start value
+    """
+    return {**convert_critic_params(sampled_params), "beta_final": None, "beta_rate": 0.0}
 
 
-def _sample_optimizer(trial: optuna.Trial) -> dict[str, Any]:
+def convert_pbrl_params(sampled_params: Params) -> Params:
+    """
+    :param sampled_params: parameters of a trial of PBRL
+    :return: constructor keywords; a schedule in the row is switched off, since it belongs to another start value
+    """
+    return {**convert_critic_params(sampled_params), "ood_weight_final": None, "adaptive_ood_weight": False}
+
+
+def _optimizer(trial: optuna.Trial) -> Params:
     return {
         "learning_rate": trial.suggest_float("learning_rate", 1e-4, 1e-3, log=True),
         "batch_size_pow": trial.suggest_int("batch_size_pow", 6, 10),
     }
 
 
-SAMPLERS: dict[str, Callable[..., dict[str, Any]]] = {
-    "dce": sample_dce_params,
-    "offline_bc": sample_bc_params,
-    "offline_td3bc": sample_td3bc_params,
-    "offline_iql": sample_iql_params,
-    "offline_sac": sample_sac_params,
-    "sac_v": sample_sac_v_params,
-    "cql_eq18": sample_cql_eq18_params,
-    "offline_cql": sample_cql_params,
-    "offline_pbrl": sample_pbrl_params,
-    "offline_uwac": sample_uwac_params,
+def _bootstrap(trial: optuna.Trial) -> Params:
+    return {
+        "one_minus_gamma": trial.suggest_float("one_minus_gamma", 1e-3, 3e-2, log=True),
+        "tau": trial.suggest_float("tau", 1e-3, 2e-2, log=True),
+    }
+
+
+def _beta(trial: optuna.Trial) -> Params:
+    return {"beta": trial.suggest_float("beta", 0.03, 30.0, log=True)}
+
+
+def _expectile(trial: optuna.Trial) -> Params:
+    return {"expectile": trial.suggest_float("expectile", 0.5, 0.95)}
+
+
+def _actor_rate(trial: optuna.Trial) -> Params:
+    return {"actor_learning_rate": trial.suggest_float("actor_learning_rate", 1e-5, 1e-3, log=True)}
+
+
+def _td3bc(trial: optuna.Trial) -> Params:
+    return {"alpha": trial.suggest_float("alpha", 0.1, 20.0, log=True)}
+
+
+def _iql(trial: optuna.Trial) -> Params:
+    return {
+        "temperature": trial.suggest_float("temperature", 0.1, 20.0, log=True),
+        "actor_dropout": trial.suggest_float("actor_dropout", 0.0, 0.3),
+    }
+
+
+def _cql(trial: optuna.Trial) -> Params:
+    return {"cql_weight": trial.suggest_float("cql_weight", 0.1, 20.0, log=True)}
+
+
+def _pbrl(trial: optuna.Trial) -> Params:
+    return {
+        "uncertainty_coef": trial.suggest_float("uncertainty_coef", 1e-5, 0.1, log=True),
+        "ood_weight": trial.suggest_float("ood_weight", 1e-3, 5.0, log=True),
+        "ood_weight_next": trial.suggest_float("ood_weight_next", 1e-3, 1.0, log=True),
+    }
+
+
+def _uwac(trial: optuna.Trial) -> Params:
+    return {
+        "uwac_beta": trial.suggest_float("uwac_beta", 0.01, 10.0, log=True),
+        "critic_dropout": trial.suggest_float("critic_dropout", 0.05, 0.3),
+        "mmd_threshold": trial.suggest_float("mmd_threshold", 0.01, 0.3, log=True),
+    }
+
+
+class SearchSpace(NamedTuple):
+    """
+    Where the hyperparameter search looks.
+
+    A trial is judged by evaluation in the simulator, so that what is found is tuned *online*: say so with results.
+
+    :param convert: from what a trial holds to constructor keywords
+    :param parts: each draws some parameters of a trial
+    """
+
+    convert: Callable[[Params], Params]
+    parts: tuple[Callable[[optuna.Trial], Params], ...]
+
+    def sample(self, trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: Params) -> Params:
+        """
+        :param trial: trial of the search
+        :param n_actions: unused, as the other arguments of rl_zoo3
+        :param n_envs: unused
+        :param additional_args: unused
+        :return: constructor keywords
+        """
+        drawn: Params = {}
+        for part in self.parts:
+            drawn |= part(trial)
+        return self.convert(drawn)
+
+
+# Weights that have a schedule (DCE, PBRL) are searched as constants.
+SPACES = {
+    "dce": SearchSpace(convert_dce_params, (_optimizer, _bootstrap, _beta, _expectile)),
+    "offline_bc": SearchSpace(convert_bc_params, (_optimizer,)),
+    "offline_td3bc": SearchSpace(convert_critic_params, (_optimizer, _bootstrap, _td3bc)),
+    "offline_iql": SearchSpace(convert_critic_params, (_optimizer, _bootstrap, _expectile, _iql)),
+    "offline_sac": SearchSpace(convert_critic_params, (_optimizer, _bootstrap)),
+    "sac_v": SearchSpace(convert_critic_params, (_optimizer, _bootstrap, _expectile)),
+    "cql_eq18": SearchSpace(convert_critic_params, (_optimizer, _bootstrap, _beta)),
+    "offline_cql": SearchSpace(convert_critic_params, (_optimizer, _bootstrap, _actor_rate, _cql)),
+    "offline_pbrl": SearchSpace(convert_pbrl_params, (_optimizer, _bootstrap, _actor_rate, _pbrl)),
+    "offline_uwac": SearchSpace(convert_critic_params, (_optimizer, _bootstrap, _uwac)),
 }
-CONVERTERS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
-    "dce": convert_dce_params,
-    "offline_bc": convert_bc_params,
-    "offline_td3bc": convert_critic_params,
-    "offline_iql": convert_critic_params,
-    "offline_sac": convert_critic_params,
-    "sac_v": convert_critic_params,
-    "cql_eq18": convert_critic_params,
-    "offline_cql": convert_critic_params,
-    "offline_pbrl": convert_pbrl_params,
-    "offline_uwac": convert_critic_params,
-}
+SAMPLERS = {algo: space.sample for algo, space in SPACES.items()}
+CONVERTERS = {algo: space.convert for algo, space in SPACES.items()}
 
 
 def register() -> dict[str, type[BaseAlgorithm]]:
