@@ -10,7 +10,7 @@ from typing import NamedTuple
 import pytest
 from rich.console import Console
 
-from sb3_dce import cli, cli_datasets
+from sb3_dce import cli, cli_datasets, cli_recording
 
 
 class Outcome(NamedTuple):
@@ -19,12 +19,13 @@ class Outcome(NamedTuple):
     stderr: str
 
 
-def run_datasets(*arguments: str) -> Outcome:
-    """``sb3-dce datasets ...``."""
+def sb3_dce(*arguments: str) -> Outcome:
+    """``sb3-dce ...``, on a terminal so wide that no line is broken."""
     stdout, stderr = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(stdout), redirect_stderr(stderr):
-        patch.setattr(sys, "argv", ["sb3-dce", "datasets", *arguments])
-        patch.setattr(cli_datasets, "console", Console(highlight=False, width=400))
+        patch.setattr(sys, "argv", ["sb3-dce", *arguments])
+        for module in (cli, cli_datasets, cli_recording):
+            patch.setattr(module, "console", Console(highlight=False, width=400))
         with pytest.raises(SystemExit) as ended:
             cli.main()
     return Outcome(int(ended.value.code or 0), stdout.getvalue(), stderr.getvalue())

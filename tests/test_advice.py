@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from commands import run_datasets
+from commands import sb3_dce
 from dataset_files import N_ROWS, base_arrays, write_plain
 
 from sb3_dce import Transitions
@@ -277,7 +277,7 @@ def test_embedded_data_have_no_warnings(dataset_id: str) -> None:
 
 
 def test_command_prints_a_line_per_check_and_returns_0_for_notes() -> None:
-    outcome = run_datasets("check", "halfcheetah-tiny-sb3")
+    outcome = sb3_dce("datasets", "check", "halfcheetah-tiny-sb3")
     assert outcome.code == 0 and outcome.stderr == ""
     for word in ("ok", "note", "finite values", "survival condition", "remedy: ", "verdict: note"):
         assert word in outcome.stdout
@@ -286,7 +286,7 @@ def test_command_prints_a_line_per_check_and_returns_0_for_notes() -> None:
 def test_command_returns_1_for_warnings(tmp_path: Path) -> None:
     arrays = clean_arrays()
     _repeat(arrays)
-    outcome = run_datasets("check", str(write_plain(tmp_path / "data.hdf5", arrays)))
+    outcome = sb3_dce("datasets", "check", str(write_plain(tmp_path / "data.hdf5", arrays)))
     assert outcome.code == 1 and outcome.stderr == ""
     assert "warning  duplicated rows" in outcome.stdout and "(number: 20)" in outcome.stdout
 
@@ -295,24 +295,24 @@ def test_command_returns_2_for_unusable_data_and_says_why_on_stderr(tmp_path: Pa
     arrays = clean_arrays()
     arrays["rewards"][3] = np.nan
     path = str(write_plain(tmp_path / "data.hdf5", arrays))
-    outcome = run_datasets("check", path)
+    outcome = sb3_dce("datasets", "check", path)
     assert outcome.code == 2
     assert "error" in outcome.stdout and "survival condition" in outcome.stdout
     assert outcome.stderr.startswith("Error: ") and "drop_nonfinite" in outcome.stderr and "Traceback" not in outcome.stderr
-    assert run_datasets("check", path, "--drop-nonfinite").code == 0
+    assert sb3_dce("datasets", "check", path, "--drop-nonfinite").code == 0
 
 
 @pytest.mark.parametrize("content", [b"not a dataset", b""])
 def test_damaged_file_is_one_error_line(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "data.hdf5"
     path.write_bytes(content)
-    outcome = run_datasets("check", str(path))
+    outcome = sb3_dce("datasets", "check", str(path))
     assert outcome.code == 2 and outcome.stderr.startswith("Error: ")
     assert outcome.stdout.startswith("error  readable")
 
 
 def test_unknown_name_is_refused() -> None:
-    outcome = run_datasets("check", "halfcheetah-medum")
+    outcome = sb3_dce("datasets", "check", "halfcheetah-medum")
     assert outcome.code == 2 and "Did you mean" in outcome.stderr
 
 
@@ -320,22 +320,22 @@ def test_bounds_given_on_the_command_line_apply(tmp_path: Path) -> None:
     arrays = clean_arrays()
     arrays["actions"] *= 2.0
     path = str(write_plain(tmp_path / "data.hdf5", arrays))
-    assert run_datasets("check", path).code == 2
-    assert run_datasets("check", path, "--action-low", "-2", "--action-high", "2").code == 0
-    assert run_datasets("check", path, "--clip-actions").code == 1
+    assert sb3_dce("datasets", "check", path).code == 2
+    assert sb3_dce("datasets", "check", path, "--action-low", "-2", "--action-high", "2").code == 0
+    assert sb3_dce("datasets", "check", path, "--clip-actions").code == 1
 
 
 def test_beta_given_on_the_command_line_applies(tmp_path: Path) -> None:
     path = str(write_plain(tmp_path / "data.hdf5", clean_arrays()))
-    assert run_datasets("check", path, "--beta", "4").code == 0
-    assert run_datasets("check", path, "--beta", "7").code == 1
+    assert sb3_dce("datasets", "check", path, "--beta", "4").code == 0
+    assert sb3_dce("datasets", "check", path, "--beta", "7").code == 1
 
 
 def test_json_says_the_same(tmp_path: Path) -> None:
     arrays = clean_arrays()
     _repeat(arrays)
     path = write_plain(tmp_path / "data.hdf5", arrays)
-    outcome = run_datasets("check", str(path), "--json")
+    outcome = sb3_dce("datasets", "check", str(path), "--json")
     found = json.loads(outcome.stdout)
     assert outcome.code == found["exit_code"] == 1 and found["verdict"] == "warning"
     assert (found["rows"], found["obs_dim"], found["act_dim"], len(found["sha256"])) == (N_ROWS, 3, 2, 64)
@@ -350,7 +350,7 @@ def test_json_says_the_same(tmp_path: Path) -> None:
 def test_json_is_complete_for_unusable_data(fault: str, tmp_path: Path) -> None:
     arrays = clean_arrays()
     FAULTS[fault][0](arrays)
-    outcome = run_datasets("check", str(write_plain(tmp_path / "data.hdf5", arrays)), "--json")
+    outcome = sb3_dce("datasets", "check", str(write_plain(tmp_path / "data.hdf5", arrays)), "--json")
     found = json.loads(outcome.stdout)
     assert outcome.code == found["exit_code"] == 2 and "error" in [check["verdict"] for check in found["checks"]]
 
@@ -376,7 +376,7 @@ def test_every_format_of_the_front_door_gives_the_same_verdicts(tmp_path: Path) 
 
 
 def test_help_states_the_exit_codes() -> None:
-    outcome = run_datasets("check", "--help")
+    outcome = sb3_dce("datasets", "check", "--help")
     assert outcome.code == 0 and "exit code" in outcome.stdout and "cannot be used" in outcome.stdout.replace("\n", " ")
 
 

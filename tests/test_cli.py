@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import shutil
 import subprocess
 import sys
 import time
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
-from typing import NamedTuple
 
 import h5py
 import numpy as np
 import pytest
 import yaml
-from rich.console import Console
+from commands import Outcome, sb3_dce
 from stable_baselines3.common.evaluation import evaluate_policy
 from typer.testing import CliRunner
 
-from sb3_dce import OfflineDCE, cli, cli_datasets
+from sb3_dce import OfflineDCE, cli
 from sb3_dce.data import find_file, load_transitions
 from sb3_dce.envs import make_env_if_possible
 from sb3_dce.errors import ConfigError
@@ -29,24 +26,6 @@ from sb3_dce.errors import ConfigError
 TINY = "halfcheetah-tiny-sb3"
 FAST = ("--set", "policy_kwargs={net_arch: [16, 16]}", "--set", "execution=eager", "--set", "batch_size=32")
 TRAIN = ("train", TINY, "--updates", "60", "--eval-freq", "30", "--eval-episodes", "2", "--seeds", "2", *FAST)
-
-
-class Outcome(NamedTuple):
-    code: int
-    stdout: str
-    stderr: str
-
-
-def sb3_dce(*arguments: str) -> Outcome:
-    """The entry point in this process, as the installed command calls it."""
-    stdout, stderr = io.StringIO(), io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(stdout), redirect_stderr(stderr):
-        patch.setattr(sys, "argv", ["sb3-dce", *arguments])
-        for module in (cli, cli_datasets):
-            patch.setattr(module, "console", Console(highlight=False, width=200))
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-    return Outcome(ended.value.code or 0, stdout.getvalue(), stderr.getvalue())
 
 
 def refused(outcome: Outcome) -> str:

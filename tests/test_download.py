@@ -23,9 +23,9 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from rich.console import Console
+from commands import sb3_dce
 
-from sb3_dce import OfflineDCE, cli, cli_datasets
+from sb3_dce import OfflineDCE
 from sb3_dce.data import catalog, find_file, load_transitions, locking
 from sb3_dce.data import download as download_module
 from sb3_dce.data.download import Patience, download
@@ -611,18 +611,10 @@ def test_unreadable_record_is_an_integrity_error(folder: Path, text: str) -> Non
         load_transitions(path)
 
 
-def test_command_downloads_and_refuses_with_one_message(
-    folder: Path, host: Host, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = ["sb3-dce", "datasets", "download", NAME, "--cache-dir", str(folder), "--mirror", f"{host.base}mirror"]
-    monkeypatch.setattr(cli_datasets, "console", Console(highlight=False, width=400))
-    monkeypatch.setattr(sys, "argv", command)
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    assert not ended.value.code and str(folder / FILE) in (out := capsys.readouterr().out) and "first use" in out
+def test_command_downloads_and_refuses_with_one_message(folder: Path, host: Host) -> None:
+    command = ("datasets", "download", NAME, "--cache-dir", str(folder), "--mirror", f"{host.base}mirror")
+    code, out, _ = sb3_dce(*command)
+    assert code == 0 and str(folder / FILE) in out and "first use" in out
     host.faults.extend([status(404)] * 2)
-    monkeypatch.setattr(sys, "argv", [*command, "--force"])
-    with pytest.raises(SystemExit) as ended:
-        cli.main()
-    err = capsys.readouterr().err
-    assert ended.value.code == 2 and err.startswith("Error: ") and err.count("HTTP 404") == 2 and "Traceback" not in err
+    code, _, err = sb3_dce(*command, "--force")
+    assert code == 2 and err.startswith("Error: ") and err.count("HTTP 404") == 2 and "Traceback" not in err

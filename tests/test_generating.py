@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
-import sys
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
+from commands import sb3_dce
 
-from sb3_dce import cli, cli_recording, load_dataset
+from sb3_dce import load_dataset
 from sb3_dce.data import D4RLFile, file_sha256, resolve, write_hdf5
 from sb3_dce.errors import ConfigError, DatasetError, DatasetFormatError, DatasetNotFoundError
 from sb3_dce.numpy_policy import MLPPolicy
@@ -307,15 +304,10 @@ def test_run_is_only_continued_with_its_own_settings(tmp_path: Path) -> None:
 
 
 def test_command_says_what_it_uses(policies: Path, tmp_path: Path) -> None:
-    stdout, stderr = io.StringIO(), io.StringIO()
     arguments = ("hopper-medium-sb3", "--policies", str(policies), "--rows", "60", "--folder", str(tmp_path), "--workers", "1")
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(stdout), redirect_stderr(stderr):
-        patch.setattr(sys, "argv", ["sb3-dce", "datasets", "generate", *arguments])
-        patch.setattr(cli_recording, "console", Console(highlight=False, width=200))
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-    assert not ended.value.code, stderr.getvalue()
-    assert "sac-Hopper.npz" in stdout.getvalue() and "60 rows" in stdout.getvalue()
+    code, stdout, stderr = sb3_dce("datasets", "generate", *arguments)
+    assert code == 0, stderr
+    assert "sac-Hopper.npz" in stdout and "60 rows" in stdout
 
 
 # -- the policies the roles name, where they are at hand -----------------------------------------------------------------

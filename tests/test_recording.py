@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import io
-import sys
-from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from commands import sb3_dce
 from gymnasium import spaces
-from rich.console import Console
 from typer.testing import CliRunner
 
-from sb3_dce import cli, cli_recording, load_dataset
+from sb3_dce import cli, load_dataset
 from sb3_dce.data import D4RLFile, content_hash, file_sha256, normalized_score
 from sb3_dce.envs import make_env_if_possible
 from sb3_dce.errors import CheckpointError, ConfigError, DatasetSemanticsError
@@ -336,17 +333,6 @@ def test_wrappers_that_change_rewards_stay() -> None:
 def test_environment_of_a_dataset_id_has_its_time_limit() -> None:
     assert EpisodeRunner(RecordingSpec("random", "walker2d-medium")).limit == 1000
     assert make_env("Pendulum-v1").action_space.shape == (1,)
-
-
-def sb3_dce(*arguments: str) -> tuple[int, str, str]:
-    """The entry point in this process: exit code, stdout, stderr."""
-    stdout, stderr = io.StringIO(), io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(stdout), redirect_stderr(stderr):
-        patch.setattr(sys, "argv", ["sb3-dce", *arguments])
-        patch.setattr(cli_recording, "console", Console(highlight=False, width=200))
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-    return int(ended.value.code or 0), stdout.getvalue(), stderr.getvalue()
 
 
 def test_command_records_into_the_folder_of_datasets(policy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

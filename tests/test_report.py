@@ -13,7 +13,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from commands import run_datasets
+from commands import sb3_dce
 from dataset_files import base_arrays, write_plain
 
 from sb3_dce import Transitions
@@ -484,7 +484,7 @@ def test_reports_need_neither_torch_nor_a_window_system(tmp_path: Path) -> None:
 def test_command_names_the_file_and_what_deserves_a_look(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     out = tmp_path / "report.html"
-    outcome = run_datasets("report", "halfcheetah-tiny-sb3", "--out", str(out))
+    outcome = sb3_dce("datasets", "report", "halfcheetah-tiny-sb3", "--out", str(out))
     assert outcome.code == 0 and outcome.stderr == "" and f"report {out}" in outcome.stdout
     assert MARKER in out.read_text() and "<h1>halfcheetah-tiny-sb3</h1>" in out.read_text()
     assert "note  actions at the bounds" in outcome.stdout and "ok " not in outcome.stdout
