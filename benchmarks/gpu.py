@@ -17,18 +17,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch as th
-from gymnasium import spaces
-from loading import ACT_DIM, OBS_DIM, RESULTS, machine, make_arrays
-from stable_baselines3 import SAC
-from stable_baselines3.common.logger import Logger
+from loading import RESULTS, machine, make_arrays
+from speed import BATCH, filled_sac, make_env
 
 from sb3_dce import OfflineDCE, Transitions
-from sb3_dce.envs import SpacesEnv
 from sb3_dce.population import Population
-
-BATCH = 256
 
 
 def updates_per_second(train: Callable[[int], None], seconds: float) -> list[float]:
@@ -67,19 +61,14 @@ def main() -> None:
         th.cuda.synchronize = lambda: None  # type: ignore[assignment]
 
     transitions = Transitions.from_arrays(**make_arrays(options.rows))
-    env = SpacesEnv(spaces.Box(-np.inf, np.inf, (OBS_DIM,), np.float64), spaces.Box(-1, 1, (ACT_DIM,), np.float32))
-    common: dict[str, Any] = {"env": env, "dataset": transitions, "batch_size": BATCH, "seed": 0}
+    common: dict[str, Any] = {"env": make_env(), "dataset": transitions, "batch_size": BATCH, "seed": 0}
     results: dict[str, list[float]] = {}
 
     def measured(name: str, train: Callable[[int], None]) -> None:
         results[name] = updates_per_second(train, options.seconds)
         print(f"  {name}: {max(results[name]):,.0f} updates/s", flush=True)
 
-    sac = SAC("MlpPolicy", env, buffer_size=len(transitions), batch_size=BATCH, seed=0, device=options.device)
-    for name in ("observations", "next_observations", "actions"):
-        getattr(sac.replay_buffer, name)[:, 0] = getattr(transitions, name)
-    sac.replay_buffer.full = True
-    sac.set_logger(Logger(None, []))
+    sac = filled_sac(transitions, options.device)
     measured("SAC.train of Stable-Baselines3", lambda n: sac.train(n, BATCH))
     for precision in ("float32", "tf32"):
         for execution in ("eager", "compile", "cudagraph") if precision == "float32" else ("cudagraph",):

@@ -46,6 +46,29 @@ DCE_MACS = 1_748_736
 Train = Callable[[int], None]
 
 
+def make_env() -> SpacesEnv:
+    """
+    :return: spaces of HalfCheetah
+    """
+    return SpacesEnv(spaces.Box(-np.inf, np.inf, (OBS_DIM,), np.float64), spaces.Box(-1, 1, (ACT_DIM,), np.float32))
+
+
+def filled_sac(transitions: Transitions, device: str) -> SAC:
+    """
+    :param transitions: data
+    :param device: where the networks lie
+    :return: SAC of Stable-Baselines3 with the data in its replay buffer
+    """
+    sac = SAC("MlpPolicy", make_env(), buffer_size=len(transitions), batch_size=BATCH, seed=0, device=device)
+    buffer = sac.replay_buffer
+    assert buffer is not None
+    for name in ("observations", "next_observations", "actions"):
+        getattr(buffer, name)[:, 0] = getattr(transitions, name)
+    buffer.rewards[:, 0], buffer.full = transitions.rewards, True
+    sac.set_logger(Logger(None, []))
+    return sac
+
+
 def make_entries(transitions: Transitions, only: list[str], executions: list[str], precision: str) -> dict[str, Train]:
     """
     :param transitions: data of all
@@ -54,13 +77,9 @@ def make_entries(transitions: Transitions, only: list[str], executions: list[str
     :param precision: of the agents' matrix products
     :return: by name, a function that runs so many updates
     """
-    env = SpacesEnv(spaces.Box(-np.inf, np.inf, (OBS_DIM,), np.float64), spaces.Box(-1, 1, (ACT_DIM,), np.float32))
-    sac = SAC("MlpPolicy", env, buffer_size=len(transitions), batch_size=BATCH, seed=0, device="cpu")
+    env, sac = make_env(), filled_sac(transitions, "cpu")
     buffer = sac.replay_buffer
-    for name in ("observations", "next_observations", "actions"):
-        getattr(buffer, name)[:, 0] = getattr(transitions, name)
-    buffer.rewards[:, 0], buffer.full = transitions.rewards, True
-    sac.set_logger(Logger(None, []))
+    assert buffer is not None
     entries: dict[str, Train] = {SAC_NAME: lambda n: sac.train(n, BATCH)}
     for algo, agent in AGENTS.items():
         if only and algo not in only:

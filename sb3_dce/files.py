@@ -32,15 +32,32 @@ def write_atomically(target: pathlib.Path) -> Iterator[BinaryIO]:
         os.replace(temporary, target)
         temporary = None
     except OSError as error:
-        raise CheckpointError(
-            f"cannot write: {error.strerror or error}",
-            where=str(target),
-            path=target,
-            hint="Check the folder's permissions and the free space, or choose another path.",
-        ) from error
+        raise _cannot_write(target, error) from error
     finally:
         if temporary is not None and os.path.exists(temporary):
             os.unlink(temporary)
+
+
+def check_writable(target: pathlib.Path) -> None:
+    """
+    :param target: file to be written later; missing folders are created
+    :raises CheckpointError: if its folder cannot be made or written
+    """
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=target.parent):
+            pass
+    except OSError as error:
+        raise _cannot_write(target, error) from error
+
+
+def _cannot_write(target: pathlib.Path, error: OSError) -> CheckpointError:
+    return CheckpointError(
+        f"cannot write: {error.strerror or error}",
+        where=str(target),
+        path=target,
+        hint="Check the folder's permissions and the free space, or choose another path.",
+    )
 
 
 def _umask() -> int:

@@ -8,7 +8,6 @@ import platform
 import re
 import shutil
 import signal
-import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping
@@ -27,7 +26,8 @@ from sb3_dce.data.catalog import DatasetSpec, normalized_score, resolve, spec_of
 from sb3_dce.data.hashes import content_hash
 from sb3_dce.data.hdf5 import write_hdf5
 from sb3_dce.data.records import bounds_attribute
-from sb3_dce.errors import CheckpointError, ConfigError, DatasetError, SB3DCEError
+from sb3_dce.errors import ConfigError, DatasetError, SB3DCEError
+from sb3_dce.files import check_writable
 from sb3_dce.numpy_policy import NumpyPolicy
 from sb3_dce.recording.episodes import Arrays, EpisodeRunner, RecordingSpec, dataset_of_env
 from sb3_dce.recording.parts import Parts
@@ -174,24 +174,6 @@ def check_target(out: Path, name: str | None, env: str | None, force: bool) -> s
         raise ConfigError("the file exists", where=str(out), path=out, key="out", hint="Choose another, or pass --force.")
     check_writable(out)
     return name
-
-
-def check_writable(out: Path) -> None:
-    """
-    :param out: file to be written later
-    :raises CheckpointError: if its folder cannot be made or written
-    """
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=out.parent):
-            pass
-    except OSError as error:
-        raise CheckpointError(
-            f"cannot write: {error.strerror or error}",
-            where=str(out),
-            path=out,
-            hint="Check the folder's permissions, or choose another path.",
-        ) from error
 
 
 def describe(name: str, env: str, arrays: Arrays) -> dict[str, Any]:
