@@ -383,3 +383,31 @@ def test_end_of_an_episode_is_kept_when_the_row_before_it_is_dropped_too() -> No
         np.arange(7.0)[:, None], np.zeros((7, 1)), rewards, np.zeros(7, bool), timeouts, drop_nonfinite=True
     )
     assert data.observations[:, 0].tolist() == [0, 1] and data.timeouts.tolist() == [False, True]
+
+
+@pytest.mark.parametrize("obs_dim", [3, 4])
+@pytest.mark.parametrize("whole_numbers", [False, True], ids=["random", "whole numbers"])
+@pytest.mark.parametrize("n_copied", [0, 1000])
+def test_repeated_rows_are_counted_whatever_their_width_and_numbers(obs_dim: int, whole_numbers: bool, n_copied: int) -> None:
+    """A hash of sums would take different whole numbers for equal, since the last bits of such floats are all zero."""
+    n, rng = 10_000, np.random.default_rng(0)
+    observations = rng.normal(size=(n, obs_dim)).astype(np.float32)
+    if whole_numbers:
+        observations = np.stack(np.unravel_index(np.arange(n), (22,) * obs_dim), axis=1).astype(np.float32)
+    zeros = np.zeros(n, dtype=np.float32)
+    arrays = {"observations": observations, "actions": zeros, "rewards": np.arange(n) % 2, "next_observations": observations}
+    arrays = {key: np.concatenate([array[n_copied:], array[:n_copied], array[:n_copied]]) for key, array in arrays.items()}
+    transitions = Transitions.from_arrays(**arrays, terminals=np.ones(n + n_copied, dtype=bool))
+    found = [text for text in transitions.info.warnings if "duplicates" in text]
+    assert found == ([] if n_copied == 0 else ["9% of the rows are duplicates of another row"])
+
+
+def test_jumps_are_found_by_the_distance_of_two_observations() -> None:
+    observations = np.zeros((100, 3), dtype=np.float32)
+    following = observations.copy()
+    following[[9, 19], [0, 2]] = 2e-6, 9e-7  # one beyond and one within the tolerance
+    following[29] = 7e-7  # all entries together are beyond it
+    rewards = terminals = np.zeros(100)
+    transitions = Transitions.from_arrays(observations, rewards, rewards, terminals, terminals, following)
+    assert np.flatnonzero(np.diff(transitions.episodes)).tolist() == [9, 29]
+    assert "2 unmarked jumps of the observation (2.02% of rows): an episode ends there" in transitions.info.notes

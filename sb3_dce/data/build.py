@@ -116,21 +116,22 @@ def build_rows(
         _require_rows(used, where)
     _check_content(rows, layout, summaries, sources, findings)
     actions = check_actions(rows[:, layout.actions], summaries["actions"], options, findings, where)
-    returns = episodes.returns(rows[:, layout.rewards.start])
-    whole = _whole_episodes(episodes, returns, bad)
+    rewards = _reward_facts(rows[:, layout.rewards.start], episodes, used)
+    whole = _whole_episodes(episodes, rewards.returns, bad)
     if "-cloned-" not in dataset_id:  # D4RL fills these up with copies of the demonstrations
         check_duplicates(rows, findings)
 
     file_rows = len(rows)
-    rows = _squeeze(rows, used)
-    rewards = rows[:, layout.rewards]
+    timeouts, index = episodes.timeouts, episodes.index
+    if not used.all():
+        rows, timeouts, index = _squeeze(rows, used), _ends_of_used(episodes, used), index[used]
     info = DatasetInfo(
         id=dataset_id,
         path=path,
         file_rows=file_rows,
         rows=len(rows),
         episodes=int(whole.sum()),
-        episode_returns=returns[whole],
+        episode_returns=rewards.returns[whole],
         episode_lengths=episodes.lengths[whole],
         episode_numbers=np.flatnonzero(whole),
         n_terminals=int(terminals.sum()),
@@ -140,9 +141,9 @@ def build_rows(
         episode_rule=episodes.rule,
         has_next_observations=has_next,
         d4rl_compat=options.d4rl_compat,
-        reward_mean=float(rewards.mean(dtype=np.float64)),
-        reward_min=float(rewards.min()),
-        reward_max=float(rewards.max()),
+        reward_mean=rewards.mean,
+        reward_min=rewards.low,
+        reward_max=rewards.high,
         action_low=actions.lowest,
         action_high=actions.highest,
         action_space_low=actions.low,
@@ -150,7 +151,24 @@ def build_rows(
         notes=tuple(findings.notes),
         warnings=tuple(findings.warnings),
     )
-    return BuiltRows(rows, layout, _ends_of_used(episodes, used), episodes.index[used], info)
+    return BuiltRows(rows, layout, timeouts, index, info)
+
+
+class _RewardFacts(NamedTuple):
+    """Return of each episode over all of its rows; mean and extremes over the used rows."""
+
+    returns: np.ndarray
+    mean: float
+    low: float
+    high: float
+
+
+def _reward_facts(column: np.ndarray, episodes: Episodes, used: np.ndarray) -> _RewardFacts:
+    rewards = column.copy()  # side by side in memory: four passes follow
+    returns = episodes.returns(rewards)
+    if not used.all():
+        rewards = rewards[used]
+    return _RewardFacts(returns, float(rewards.mean(dtype=np.float64)), float(rewards.min()), float(rewards.max()))
 
 
 def _ends_of_used(episodes: Episodes, used: np.ndarray) -> np.ndarray:
@@ -209,8 +227,6 @@ def _whole_episodes(episodes: Episodes, returns: np.ndarray, bad: np.ndarray | N
 def _squeeze(rows: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Move the used rows to the front, in place and in order. The memory behind them stays allocated."""
     end = 0
-    if used.all():
-        return rows
     for block in row_blocks(len(rows), WIDE_BLOCK_ROWS):
         chosen = rows[block][used[block]]
         rows[end : end + len(chosen)] = chosen

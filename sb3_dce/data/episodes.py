@@ -177,7 +177,10 @@ def find_jumps(rows: np.ndarray, layout: RowLayout) -> np.ndarray:
     for block in row_blocks(len(rows) - 1):
         following = rows[block, layout.next_observations]
         observed = rows[block.start + 1 : block.stop + 1, layout.observations]
-        differs = np.flatnonzero((following != observed).any(axis=1))
+        # which rows have differing entries: several times faster than any(axis=1) over few columns
+        at = np.zeros(len(observed), dtype=bool)
+        at[np.flatnonzero(following != observed) // layout.obs_dim] = True
+        differs = np.flatnonzero(at)
         distance = np.linalg.norm(following[differs].astype(np.float64) - observed[differs], axis=1)
         jumps[block.start + differs[distance > JUMP_TOLERANCE]] = True
     return jumps

@@ -1,9 +1,10 @@
-"""Hashes: of the numbers of a dataset, and of the bytes of a file."""
+"""Hashes: of the numbers of a dataset, of its rows, and of the bytes of a file."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from functools import lru_cache
 from os import PathLike
 
 import numpy as np
@@ -30,6 +31,17 @@ def content_hash(arrays: Mapping[str, ArraySource]) -> str:
     return digest.hexdigest()
 
 
+def row_hashes(rows: np.ndarray) -> np.ndarray:
+    """
+    A 64-bit hash of the bits of each row, to find equal ones: a sum of the entries with random odd weights. The upper half is
+    the better one, since the last bits of whole numbers are zero. No protection against anybody.
+
+    :param rows: float32, shape (n, width)
+    :return: uint64, shape (n,)
+    """
+    return np.asarray(np.einsum("ij,j->i", rows.view(np.uint32).astype(np.uint64), _odd_weights(rows.shape[1])))
+
+
 def file_sha256(path: str | PathLike[str]) -> str:
     """
     Hash of the bytes of a file.
@@ -42,3 +54,8 @@ def file_sha256(path: str | PathLike[str]) -> str:
         while block := file.read(2**20):
             digest.update(block)
     return digest.hexdigest()
+
+
+@lru_cache(maxsize=8)
+def _odd_weights(n: int) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 2**63, n, dtype=np.uint64) * np.uint64(2) + np.uint64(1)

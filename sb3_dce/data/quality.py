@@ -13,6 +13,7 @@ import numpy as np
 
 from sb3_dce.data.columns import ColumnSummary
 from sb3_dce.data.episodes import MAX_JUMP_SHARE, Episodes, find_jumps, find_shift
+from sb3_dce.data.hashes import row_hashes
 from sb3_dce.data.layout import WIDE_BLOCK_ROWS, RowLayout, row_blocks
 from sb3_dce.data.records import ReadOptions
 from sb3_dce.errors import DatasetSemanticsError
@@ -214,17 +215,17 @@ def check_order(
 
 def check_duplicates(rows: np.ndarray, findings: Findings) -> None:
     """
-    Look for rows that occur more than once, by a 64-bit hash of each row (a weighted sum of its bits with random odd weights).
+    Look for rows that occur more than once, by a hash of each row.
 
     :param rows: row matrix
     :param findings: notes and warnings
     """
-    weights = np.random.default_rng(0).integers(0, 2**63, rows.shape[1], dtype=np.uint64) * np.uint64(2) + np.uint64(1)
-    hashes = np.empty(len(rows), dtype=np.uint64)
+    hashes = np.empty(len(rows), dtype=np.uint32)
     for block in row_blocks(len(rows), WIDE_BLOCK_ROWS):
-        hashes[block] = (rows[block].view(np.uint32) * weights).sum(axis=1)
+        hashes[block] = row_hashes(rows[block]) >> np.uint64(32)
     hashes.sort()
-    share = float((hashes[1:] == hashes[:-1]).sum()) / len(rows)
+    # of n different rows, n / 2**33 share their 32 bits with another one by chance
+    share = float((hashes[1:] == hashes[:-1]).sum()) / len(rows) - len(rows) / 2**33
     if share > MAX_DUPLICATES:
         findings.warnings.append(f"{share:.0%} of the rows are duplicates of another row")
 
