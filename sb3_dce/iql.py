@@ -63,7 +63,7 @@ class OfflineIQL(OfflineAlgorithm):
 
     algo_name: ClassVar[str] = "offline_iql"
     networks = ("actor", "critic", "critic_target", "value_net")
-    population_scalars = frozenset({"expectile", "temperature", "max_weight"})
+    population_scalars = frozenset({"expectile", "temperature", "max_weight", "actor_lr_schedule"})
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": OfflineIQLPolicy}
     policy: OfflineIQLPolicy
     actor: GaussianActor

@@ -63,7 +63,7 @@ def test_killed_population_goes_on_to_the_same_members(tmp_path: Path) -> None:
     code = (
         "import sys; from pathlib import Path; sys.path.insert(0, sys.argv[2])\n"
         "from test_population_runs import batched\n"
-        "batched(Path(sys.argv[1]), n_updates=400).run()"
+        "batched(Path(sys.argv[1]), n_updates=120).run()"
     )
     arguments = [sys.executable, "-c", code, str(folder), str(Path(__file__).parent)]
     killed = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, start_new_session=True)
@@ -74,7 +74,7 @@ def test_killed_population_goes_on_to_the_same_members(tmp_path: Path) -> None:
     killed.wait()
     assert (folder / STATE_FILE).exists() and not (folder / "seed_0" / "result.json").exists()
     for kind in ("killed", "whole"):
-        batched(tmp_path / kind, n_updates=400).run()
+        batched(tmp_path / kind, n_updates=120).run()
     for seed in range(2):
         one, other = (OfflineDCE.load(tmp_path / kind / f"seed_{seed}" / "model.zip") for kind in ("killed", "whole"))
         assert largest_difference(all_tensors(one), all_tensors(other)) == 0.0
