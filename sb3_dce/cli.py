@@ -43,7 +43,7 @@ def demo(
 @app.command()
 def train(
     dataset: DatasetArgument,
-    algo: Annotated[str, typer.Option(help="Agent: the name of a file in zoo_hyperparams: dce, offline_iql, ...")] = "dce",
+    algo: Annotated[str, typer.Option(help="Agent: dce, iql, td3bc, ... (the files in zoo_hyperparams).")] = "dce",
     updates: Annotated[
         float, typer.Option(min=0, show_default=False, help="Gradient steps, e.g. 1e6; default: the dataset's row.")
     ] = 0,
@@ -80,7 +80,7 @@ def train(
 @app.command()
 def compare(
     dataset: Annotated[str, typer.Option(help="Id such as [b]walker2d-medium[/b], or a file.")],
-    algos: Annotated[str, typer.Option(help="Agents, separated by commas.")] = "dce,offline_bc",
+    algos: Annotated[str, typer.Option(help="Agents, separated by commas: dce,iql,cql, ...")] = "dce,offline_bc",
     updates: Annotated[float, typer.Option(min=1, help="Gradient steps of each run, e.g. 1e5.")] = 1e6,
     seeds: Annotated[int, typer.Option(min=1, help="Seeds of each agent.")] = 3,
     eval_freq: Annotated[int, typer.Option(min=1, help="Gradient steps between two evaluations and checkpoints.")] = 5000,

@@ -19,6 +19,7 @@ from sb3_dce.data.locate import short_name
 from sb3_dce.errors import ConfigError
 from sb3_dce.evaluation import read_evaluations
 from sb3_dce.files import write_atomically
+from sb3_dce.hyperparams import full_name
 from sb3_dce.launch import launch
 from sb3_dce.plots import plot_learning_curves
 from sb3_dce.runs import RunSpec, read_result
@@ -61,7 +62,7 @@ def compare(
     Train every agent with every seed, each with the dataset's row of its own file; show and write the comparison.
 
     :param dataset: id or file
-    :param algos: names of agents
+    :param algos: names of agents, with or without ``offline_``
     :param n_updates: gradient steps of each run
     :param seeds: seeds
     :param eval_freq: gradient steps between two evaluations
@@ -73,6 +74,7 @@ def compare(
     :raises ConfigError: for an unknown agent
     :raises SB3DCEError: the first error of a run; what the others have done is kept and resumed by the same call
     """
+    algos = [full_name(algo) for algo in algos]
     if len(set(algos)) != len(algos) or not algos:
         raise ConfigError(
             f"name each agent once, got {', '.join(algos)}", key="--algos", hint="For example --algos dce,offline_bc."
@@ -121,6 +123,8 @@ def summarize(
         level = float(normalized_score(dataset_id, level))
     _show(rows, level, dataset_id is not None, console)
     curves = {algo: [read_evaluations(run, dataset_id) for run in sorted((folder / algo).glob("seed_*"))] for algo in results}
+    # a run that has not been evaluated yet has no part in the mean, which goes as far as the shortest
+    curves = {algo: evaluated for algo, seeds in curves.items() if (evaluated := [seed for seed in seeds if seed])}
     levels = {} if level is None else {"mean of the data": level}
     title = folder.name.removeprefix("compare-") if dataset_id is None else dataset_id
     picture = plot_learning_curves(curves, folder / "comparison.png", title, levels, confidence=True)

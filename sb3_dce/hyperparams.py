@@ -52,21 +52,42 @@ class SplitRow(NamedTuple):
     zoo: dict[str, Any]
 
 
+def _folder() -> Traversable:
+    return resources.files("sb3_dce.zoo_hyperparams")
+
+
+def known_algorithms() -> list[str]:
+    """
+    :return: names of the algorithms that have a file, in alphabetical order
+    """
+    return sorted(entry.name.removesuffix(".yml") for entry in _folder().iterdir() if entry.name.endswith(".yml"))
+
+
+def full_name(algo: str) -> str:
+    """
+    What a user types for what a file is called: ``iql`` is ``offline_iql``. In rl_zoo3 the short names are taken.
+
+    :param algo: name of an algorithm, with or without ``offline_``
+    :return: its full name; an unknown name as it is
+    """
+    known = known_algorithms()
+    return f"offline_{algo}" if algo not in known and f"offline_{algo}" in known else algo
+
+
 def file_of(algo: str) -> Traversable:
     """
     :param algo: name of an algorithm, e.g. ``dce``
     :return: its file inside the installed package
     :raises ConfigError: if there is none
     """
-    folder = resources.files("sb3_dce.zoo_hyperparams")
-    known = sorted(entry.name.removesuffix(".yml") for entry in folder.iterdir() if entry.name.endswith(".yml"))
+    known = known_algorithms()
     if algo not in known:
         raise ConfigError(
             f"no hyperparameters for algorithm {algo!r}",
             key="algo",
             hint=f"{did_you_mean(algo, known)}Known: {', '.join(known)}.",
         )
-    return folder / f"{algo}.yml"
+    return _folder() / f"{algo}.yml"
 
 
 def read_rows(algo: str) -> dict[str, dict[str, Any]]:

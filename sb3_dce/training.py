@@ -40,7 +40,7 @@ def train_seeds(
     """
     Train one agent with several seeds; show the progress, the results and where they are.
 
-    :param algo: name of the agent
+    :param algo: name of the agent, with or without ``offline_``
     :param dataset: id or file
     :param n_updates: gradient steps; ``None`` takes those of the dataset's row
     :param seeds: seeds
@@ -52,6 +52,7 @@ def train_seeds(
     :param console: where to print
     :return: results, one per seed
     """
+    algo = hyperparams.full_name(algo)
     agent = agent_class(algo)
     hyperparams.check_keys(agent, overrides, where="--set")
     path, spec = find_file(dataset)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from sb3_dce.compare import compare, summarize
 from sb3_dce.data import resolve
 from sb3_dce.data.catalog import normalized_score
 from sb3_dce.errors import ConfigError
+from sb3_dce.evaluation import Evaluation, write_evaluations
 from sb3_dce.plots import _interval
 
 TINY = "halfcheetah-tiny-sb3"
@@ -21,7 +23,7 @@ TINY = "halfcheetah-tiny-sb3"
 
 def test_comparison_trains_writes_and_goes_on(tmp_path: Path) -> None:
     quiet = Console(quiet=True)
-    arguments = (TINY, ["offline_bc", "sac_v"], 4, range(1), 2, 1, 2, tmp_path)
+    arguments = (TINY, ["bc", "sac_v"], 4, range(1), 2, 1, 2, tmp_path)
     rows = compare(*arguments, quiet)
     assert [row.agent for row in rows] == ["offline_bc", "sac_v"] and all(row.n_updates == 4 for row in rows)
     assert (tmp_path / "comparison.png").stat().st_size > 10_000
@@ -53,8 +55,28 @@ def test_table_is_made_from_the_complete_runs(tmp_path: Path, capsys: pytest.Cap
     assert f"{normalized_score(TINY, 4651.0):.1f}" in shown
 
 
+def test_runs_without_an_evaluation_are_left_out_of_the_curves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: dict[str, Any] = {}
+    monkeypatch.setattr("sb3_dce.compare.plot_learning_curves", lambda curves, *_, **__: drawn.update(curves))
+    for algo, seeds in {"dce": 3, "offline_bc": 1}.items():
+        for seed in range(seeds):
+            folder = tmp_path / algo / f"seed_{seed}"
+            folder.mkdir(parents=True)
+            result = {"config": {"seed": seed}, "n_updates": 20, "seconds": 10.0, "mean_return": 1.0}
+            (folder / "result.json").write_text(json.dumps({**result, "normalized_score": 1.0}))
+    for seed in range(2):
+        evaluations = [Evaluation(n, (1.0, 2.0), (5, 5), None) for n in (10, 20)]
+        write_evaluations(tmp_path / "dce" / f"seed_{seed}", evaluations)
+    summarize(tmp_path, ["dce", "offline_bc"], resolve(TINY), None, Console(quiet=True))
+    assert list(drawn) == ["dce"] and [len(seed) for seed in drawn["dce"]] == [2, 2]
+
+
 def test_agents_that_do_not_exist_or_come_twice_are_refused(tmp_path: Path) -> None:
-    for algos, message in ((["dce", "dce"], "each agent once"), (["ddce"], "Did you mean 'dce'"), ([], "each agent once")):
+    for algos, message in (
+        (["iql", "offline_iql"], "each agent once"),
+        (["ddce"], "Did you mean 'dce'"),
+        ([], "each agent once"),
+    ):
         with pytest.raises(ConfigError, match=message):
             compare(TINY, algos, 4, range(1), 2, 1, 1, tmp_path, Console(quiet=True))
     with pytest.raises(ConfigError, match="no complete run"):

@@ -152,6 +152,11 @@ def test_unknown_algorithm_names_the_known_ones() -> None:
         hyperparams.load_row("dcee", "pen-human-v0")
 
 
+def test_short_names_are_completed_and_others_left_alone() -> None:
+    names = ("iql", "sac", "offline_bc", "dce", "sac_v", "cql_eq18", "unknown")
+    assert [hyperparams.full_name(name) for name in names] == ["offline_iql", "offline_sac", *names[2:]]
+
+
 def test_algorithm_name_is_not_a_path() -> None:
     with pytest.raises(ConfigError):
         hyperparams.load_row("../zoo_hyperparams/dce", "pen-human-v0")
