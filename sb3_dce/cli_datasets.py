@@ -182,6 +182,9 @@ def download_dataset(
     mirror: Annotated[
         list[str] | None, typer.Option(metavar="URL", help="Base URL tried before the official one; repeat it.")
     ] = None,
+    sha256: Annotated[
+        str | None, typer.Option(metavar="HEX", show_default=False, help="Hash the file must have, if you know it.")
+    ] = None,
     force: Annotated[bool, typer.Option(help="Download even if the file is there, and replace it.")] = False,
 ) -> None:
     """Download a dataset of D4RL or, by minari, of Minari. The same command goes on with an interrupted download."""
@@ -191,9 +194,9 @@ def download_dataset(
         from sb3_dce.data.minari_download import REMOTE_VARIABLE, download_minari
         from sb3_dce.errors import ConfigError
 
-        if cache_dir is not None or mirror:
+        if cache_dir is not None or mirror or sha256:
             raise ConfigError(
-                "--cache-dir and --mirror are for D4RL's files",
+                "--cache-dir, --mirror and --sha256 are for D4RL's files",
                 where=dataset,
                 hint=f"Minari has ${ROOT_VARIABLE} for the folder and ${REMOTE_VARIABLE} for the source.",
             )
@@ -211,6 +214,7 @@ def download_dataset(
             dataset,
             cache_dir=cache_dir,
             mirrors=mirror,
+            sha256=sha256,
             force=force,
             progress=lambda received, size: bar.update(task, completed=received, total=size, visible=True),
             note=lambda text: bar.console.print(f"note   {text}", markup=False),

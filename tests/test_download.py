@@ -24,13 +24,14 @@ import h5py
 import numpy as np
 import pytest
 from commands import sb3_dce
+from dataset_files import base_arrays, write_plain
 
 from sb3_dce import OfflineDCE
-from sb3_dce.data import catalog, find_file, load_transitions, locking
+from sb3_dce.data import catalog, find_file, load_dataset, load_transitions, locking
 from sb3_dce.data import download as download_module
 from sb3_dce.data.download import Patience, download
 from sb3_dce.data.hash_record import record_path
-from sb3_dce.errors import DatasetIntegrityError, DatasetNotFoundError, DownloadError
+from sb3_dce.errors import ConfigError, DatasetIntegrityError, DatasetNotFoundError, DownloadError
 
 NAME = "halfcheetah-medium-v2"
 FILE = "halfcheetah_medium-v2.hdf5"
@@ -337,6 +338,33 @@ def test_wrong_hash_of_all_sources_is_an_integrity_error(
     with pytest.raises(DatasetIntegrityError, match=f"{hashlib.sha256(payload).hexdigest()}, expected {'0' * 64}"):
         get(folder)
     assert {FILE, f"{FILE}.part"}.isdisjoint(names(folder))
+
+
+def test_hash_of_the_user_counts_for_the_download_and_for_the_file_that_is_here(
+    folder: Path, host: Host, payload: bytes
+) -> None:
+    """L-07, with a hash that is known from elsewhere."""
+    digest, other = hashlib.sha256(payload).hexdigest(), "0" * 64
+    with pytest.raises(DatasetIntegrityError, match=f"{digest}, expected {other}"):
+        get(folder, sha256=other)
+    assert FILE not in names(folder)
+    notes: list[str] = []
+    assert get(folder, sha256=digest.upper(), note=notes.append).read_bytes() == payload
+    assert not any("trusted on first use" in text for text in notes)
+    with pytest.raises(DatasetIntegrityError, match=f"{digest}, expected {other}"):
+        get(folder, sha256=other)
+
+
+@pytest.mark.parametrize("load", [load_transitions, load_dataset])
+def test_loading_compares_the_file_with_the_hash_of_the_user(tmp_path: Path, load: Callable[..., Any]) -> None:
+    path = write_plain(tmp_path / "mine.hdf5", base_arrays())
+    digest, other = hashlib.sha256(path.read_bytes()).hexdigest(), "0" * 64
+    assert load(path, sha256=digest).info.sha256 == digest
+    with pytest.raises(DatasetIntegrityError, match=f"{digest}, expected {other}") as caught:
+        load(path, sha256=other)
+    assert caught.value.path == path
+    with pytest.raises(ConfigError, match="64 hexadecimal digits, got 'abc'"):
+        load(path, sha256="abc")
 
 
 def test_error_page_is_shown_and_not_kept(folder: Path, host: Host) -> None:

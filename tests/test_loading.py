@@ -78,6 +78,19 @@ def test_front_door_refuses_what_holds_no_steps() -> None:
 # -- actions in other units --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("kind", ["arrays", "frame", "csv", "npz", "hdf5", "buffer"])
+def test_an_option_that_no_reader_has_is_refused_with_a_near_miss(kind: str, tmp_path: Path) -> None:
+    arrays, path = base_arrays(), tmp_path / f"mine.{kind}"
+    if kind in ("hdf5", "npz"):
+        getattr(Transitions.from_arrays(**arrays), f"to_{kind}")(path)
+    elif kind == "csv":
+        as_frame(arrays).to_csv(path, index=False)
+    sources = {"arrays": arrays, "frame": as_frame(arrays), "buffer": as_buffer(arrays)}
+    with pytest.raises(ConfigError, match="'action_scales' is no option of this reader") as caught:
+        load_dataset(sources.get(kind, path), action_scales="data")
+    assert caught.value.key == "action_scales" and caught.value.hint == "Did you mean action_scale?"
+
+
 def test_action_scale_takes_the_bounds_of_the_data_and_says_so() -> None:
     arrays = base_arrays()
     arrays["actions"] = arrays["actions"] * [50, 0] + [50, 7]

@@ -29,8 +29,7 @@ from urllib.request import Request
 
 from sb3_dce.data.catalog import D4RL_URL, DatasetSpec, resolve
 from sb3_dce.data.file_checks import HDF5_SIGNATURE
-from sb3_dce.data.hash_record import read_record, record_path, verify_record, write_record
-from sb3_dce.data.hashes import file_sha256
+from sb3_dce.data.hash_record import as_sha256, read_record, record_path, verify_hash, verify_record, write_record
 from sb3_dce.data.hdf5 import D4RLFile
 from sb3_dce.data.locate import DATASETS_VARIABLE, search, search_folders
 from sb3_dce.data.locking import exclusive
@@ -74,6 +73,7 @@ def download(
     *,
     cache_dir: str | PathLike[str] | None = None,
     mirrors: Sequence[str] | None = None,
+    sha256: str | None = None,
     force: bool = False,
     progress: ProgressCallback | None = None,
     note: NoteCallback = _LOG.info,
@@ -83,12 +83,13 @@ def download(
     The file of a D4RL dataset, downloaded if it is not on this machine. Proxies are taken from the environment.
 
     No hashes of D4RL's files have been published, so the hash of the first download is recorded beside the file and has to be
-    met by every later one and whenever the file has changed before it is loaded.
+    met by every later one and whenever the file has changed before it is loaded. Who has the hash from elsewhere gives it.
 
     :param name: id or alias of the catalogue
     :param cache_dir: folder of the file; default: the first one of those in which datasets are looked for
     :param mirrors: base URLs to which the catalogue's path is appended, tried in this order; those of ``$SB3_DCE_MIRRORS``
         (separated by blanks or commas) come next, the official one last
+    :param sha256: hash the file must have, 64 hexadecimal digits; also a file that is here already is compared with it
     :param force: download even if the file is there, and replace it
     :param progress: called with the bytes received so far and those of the whole file, if known
     :param note: called with what a person should know: a retry, a first use; default: logged as information
@@ -96,20 +97,21 @@ def download(
     :return: existing file
     :raises DownloadError: if no source delivers the file, or it cannot be written
     :raises DatasetIntegrityError: if a source delivers something else than the file, or the file here is not the recorded one
+    :raises ConfigError: if ``sha256`` is no hash
     """
-    spec = resolve(name)
+    spec, pin = resolve(name), as_sha256(sha256)
     target = (search_folders()[0] if cache_dir is None else Path(cache_dir).expanduser()) / spec.file_name
     if not force:
         elsewhere = search(spec) if cache_dir is None or spec.url is None else None
         if (here := target if target.is_file() else elsewhere) is not None:
-            return _checked(here, spec)
+            return _checked(here, spec, pin)
     urls = _urls(spec, target, mirrors)
     with _local_errors(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         with exclusive(target.with_name(f"{target.name}.lock"), limit=patience.lock, note=note):
             if force or not target.is_file():  # another process may have made it meanwhile
-                _Download(spec, target, progress, note, patience).run(urls)
-    return _checked(target, spec)
+                _Download(spec, target, pin, progress, note, patience).run(urls)
+    return _checked(target, spec, pin)
 
 
 class _Download:
@@ -118,13 +120,20 @@ class _Download:
 
     :param spec: entry of the catalogue
     :param target: file to make
+    :param pin: as in :func:`download`
     :param progress: as in :func:`download`
     :param note: as in :func:`download`
     :param patience: as in :func:`download`
     """
 
     def __init__(
-        self, spec: DatasetSpec, target: Path, progress: ProgressCallback | None, note: NoteCallback, patience: Patience
+        self,
+        spec: DatasetSpec,
+        target: Path,
+        pin: str | None,
+        progress: ProgressCallback | None,
+        note: NoteCallback,
+        patience: Patience,
     ) -> None:
         self._spec, self._target, self._note, self._patience = spec, target, note, patience
         self._progress = progress or (lambda received, size: None)
@@ -132,7 +141,8 @@ class _Download:
         self._sidecar = target.with_name(f"{target.name}.part.json")
         self._opener = make_opener(patience)
         record = read_record(target)
-        self._expected = spec.sha256 or (record.sha256 if record else None)
+        self._recorded = record.sha256 if record else None
+        self._expected = pin or spec.sha256 or self._recorded
 
     def run(self, urls: Sequence[str]) -> None:
         """
@@ -281,7 +291,7 @@ class _Download:
         hint += f"or another source with --mirror or ${MIRRORS_VARIABLE}."
         if kept:
             hint += f" {kept:,} bytes have been received and are kept; the same command goes on from there."
-        if kind is DatasetIntegrityError and self._expected != self._spec.sha256:
+        if kind is DatasetIntegrityError and self._expected == self._recorded:
             hint += f" If the publisher has replaced the file, delete {record_path(self._target)}."
         return kind(f"no source delivers the file:{lines}", where=f"dataset {self._spec.id}", hint=hint, path=self._target)
 
@@ -313,12 +323,11 @@ def _is_http(address: str) -> bool:
     return parts.scheme in ("http", "https") and bool(parts.hostname)
 
 
-def _checked(path: Path, spec: DatasetSpec) -> Path:
+def _checked(path: Path, spec: DatasetSpec, pin: str | None) -> Path:
     """A file that is here, if it is the expected one."""
     verify_record(path)
-    if spec.sha256 is not None and (got := file_sha256(path)) != spec.sha256:
-        what = f"SHA-256 is {got}, expected {spec.sha256}"
-        raise DatasetIntegrityError(what, where=str(path), hint="Replace it with force=True (--force)", path=path)
+    if expected := pin or spec.sha256:
+        verify_hash(path, expected, "Replace it with force=True (--force)")
     return path
 
 

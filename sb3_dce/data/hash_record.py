@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 from sb3_dce.data.catalog import spec_of_file
 from sb3_dce.data.file_checks import read_head
 from sb3_dce.data.hashes import file_sha256
-from sb3_dce.errors import DatasetIntegrityError
+from sb3_dce.errors import ConfigError, DatasetIntegrityError
 from sb3_dce.files import write_atomically
 
 _MAX_BYTES = 2**16
@@ -56,6 +57,34 @@ def verify_record(path: Path) -> None:
             hint=f"{again}; or, if the change is yours, delete {record_path(path)}",
             path=path,
         )
+
+
+def verify_hash(path: Path, expected: str, hint: str) -> None:
+    """
+    Compare a file with a hash.
+
+    :param path: existing file
+    :param expected: SHA-256, 64 hexadecimal digits
+    :param hint: what to do if it is another one
+    :raises DatasetIntegrityError: if it is another one
+    """
+    if (got := file_sha256(path)) != expected:
+        raise DatasetIntegrityError(f"SHA-256 is {got}, expected {expected}", where=str(path), hint=hint, path=path)
+
+
+def as_sha256(text: str | None) -> str | None:
+    """
+    :param text: what a user gives as hash of a file
+    :return: the same in small letters
+    :raises ConfigError: if it is not 64 hexadecimal digits
+    """
+    if text is None:
+        return None
+    if re.fullmatch("[0-9a-fA-F]{64}", text) is None:
+        raise ConfigError(
+            f"a SHA-256 has 64 hexadecimal digits, got {text!r}", key="sha256", hint="Print it with: sha256sum FILE"
+        )
+    return text.lower()
 
 
 def record_path(path: Path) -> Path:

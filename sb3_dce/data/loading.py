@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from os import PathLike
 from typing import Any
 
-from sb3_dce.data.hash_record import verify_record
+from sb3_dce.data.hash_record import as_sha256, verify_hash, verify_record
 from sb3_dce.data.layout import CORE_KEYS
 from sb3_dce.data.locate import find_file
 from sb3_dce.data.minari import folder_of, is_minari_name
@@ -22,23 +22,32 @@ _READERS: dict[str, Callable[..., Transitions]] = {
 }
 
 
-def load_transitions(name_or_path: str | PathLike[str], **options: Any) -> Transitions:
+def load_transitions(name_or_path: str | PathLike[str], *, sha256: str | None = None, **options: Any) -> Transitions:
     """
     Find a dataset on this machine and read it. Nothing is downloaded.
 
     :param name_or_path: id or alias of the catalogue; ``minari:`` and an id of Minari, or the folder of such a dataset; or a
         file: NPZ, CSV and Parquet by suffix, any other is taken for HDF5 in D4RL's layout
+    :param sha256: hash the file must have, 64 hexadecimal digits; not for Minari, whose datasets are folders
     :param options: fields of :class:`~sb3_dce.data.records.ReadOptions`, e.g. ``d4rl_compat=True``, and of the reader
         of this suffix, e.g. ``sep=";"`` (see the class methods of :class:`~sb3_dce.data.transitions.Transitions`)
     :return: the dataset
     :raises DatasetNotFoundError: if the file is not on this machine
-    :raises DatasetIntegrityError: if the file is not the one that was downloaded
+    :raises DatasetIntegrityError: if the file is not the one that was downloaded, or has another hash
+    :raises ConfigError: if ``sha256`` is no hash
     :raises DatasetError: if something is wrong with the dataset
     """
+    pin = as_sha256(sha256)
     if is_minari_name(name_or_path) or folder_of(name_or_path) is not None:
+        if pin is not None:
+            raise ConfigError(
+                "a dataset of Minari is a folder", where=str(name_or_path), key="sha256", hint="Leave sha256 out."
+            )
         return Transitions.from_minari(name_or_path, **options)
     path, spec = find_file(name_or_path)
     verify_record(path)
+    if pin is not None:
+        verify_hash(path, pin, "Get the file again, or correct sha256=")
     read = _READERS.get(path.suffix.lower(), Transitions.from_hdf5)
     return read(path, spec=spec, **options)
 

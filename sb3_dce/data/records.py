@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import os
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -79,6 +81,24 @@ class ReadOptions:
                 key="action_scale",
                 hint="100.0 means actions in [-100, 100]",
             )
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any]) -> ReadOptions:
+        """
+        :param options: what a user gives as keyword arguments of a reader
+        :return: options
+        :raises ConfigError: for a name that is none of these options, or a value that makes no sense
+        """
+        names = [option.name for option in fields(cls)]
+        for name in options:
+            if name not in names:
+                close = difflib.get_close_matches(name, names, n=1)
+                raise ConfigError(
+                    f"{name!r} is no option of this reader; there are {', '.join(names)}",
+                    key=name,
+                    hint=f"Did you mean {close[0]}?" if close else "Leave it out",
+                )
+        return cls(**options)
 
     def with_bounds_of(self, attribute: Any, where: str) -> ReadOptions:
         """

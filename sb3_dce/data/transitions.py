@@ -13,6 +13,7 @@ import numpy as np
 
 from sb3_dce.data.build import BuiltRows, build_rows
 from sb3_dce.data.catalog import DatasetSpec, normalized_score
+from sb3_dce.data.hash_record import verify_hash
 from sb3_dce.data.hashes import content_hash, file_sha256
 from sb3_dce.data.hdf5 import D4RLFile, write_hdf5
 from sb3_dce.data.layout import CORE_KEYS, ArraySource, RowLayout
@@ -23,7 +24,7 @@ from sb3_dce.data.records import BOUNDS_ATTRIBUTE, DatasetInfo, ReadOptions, bou
 from sb3_dce.data.row_cache import cached_rows
 from sb3_dce.data.sb3_buffer import arrays_from_replay_buffer
 from sb3_dce.data.tables import Columns, arrays_from_csv, arrays_from_dataframe, arrays_from_parquet
-from sb3_dce.errors import DatasetError, DatasetIntegrityError, DatasetSemanticsError, DatasetWarning
+from sb3_dce.errors import DatasetError, DatasetSemanticsError, DatasetWarning
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -86,7 +87,7 @@ class Transitions:
         :return: the dataset
         :raises DatasetError: if the file is missing, damaged, dangerous, of another layout, or its numbers make no sense
         """
-        path, read_options = Path(path), ReadOptions(**options)
+        path, read_options = Path(path), ReadOptions.of(options)
         try:
             if spec is not None and spec.sha256 is not None:
                 _check_hash(path, spec)
@@ -127,7 +128,7 @@ class Transitions:
         given = zip(CORE_KEYS, (observations, actions, rewards, terminals, timeouts, next_observations), strict=True)
         sources = {key: np.asarray(array) for key, array in given if array is not None}
         dataset_id = spec.id if spec else "arrays"
-        return cls._build(sources, dataset_id, None, sources, spec, ReadOptions(**options))
+        return cls._build(sources, dataset_id, None, sources, spec, ReadOptions.of(options))
 
     @classmethod
     def from_npz(cls, path: str | PathLike[str], *, spec: DatasetSpec | None = None, **options: Any) -> Transitions:
@@ -140,7 +141,7 @@ class Transitions:
         :return: the dataset
         :raises DatasetError: if the file is missing, damaged, dangerous, of another layout, or its numbers make no sense
         """
-        read_options = ReadOptions(**options)
+        read_options = ReadOptions.of(options)
 
         def read() -> dict[str, np.ndarray]:
             return arrays_from_npz(path, max_bytes=read_options.max_bytes)
@@ -169,7 +170,7 @@ class Transitions:
         :return: the dataset
         :raises DatasetError: if the file is missing, a line of it is wrong, or its numbers make no sense
         """
-        read_options = ReadOptions(**options)
+        read_options = ReadOptions.of(options)
 
         def read() -> dict[str, np.ndarray]:
             return arrays_from_csv(path, columns, sep=sep, max_bytes=read_options.max_bytes)
@@ -196,7 +197,7 @@ class Transitions:
         :raises ConfigError: if pyarrow is not installed
         :raises DatasetError: if the file is missing or damaged, or its numbers make no sense
         """
-        read_options = ReadOptions(**options)
+        read_options = ReadOptions.of(options)
 
         def read() -> dict[str, np.ndarray]:
             return arrays_from_parquet(path, columns, max_bytes=read_options.max_bytes)
@@ -255,7 +256,7 @@ class Transitions:
         bounds = action_bounds(dataset)
         if not any(options.get(key) is not None for key in ("action_low", "action_high", "action_scale")):
             options |= bounds
-        read_options = ReadOptions(**options)
+        read_options = ReadOptions.of(options)
 
         def read() -> BuiltRows:
             with open_episodes(dataset, flatten, read_options.max_bytes) as (sources, notes):
@@ -426,9 +427,5 @@ def _rows_of_hdf5(path: Path, spec: DatasetSpec | None, options: ReadOptions) ->
 
 def _check_hash(path: Path, spec: DatasetSpec) -> None:
     """Compare a file with the hash of the catalogue; only files that come with the package have one."""
-    if path.is_file() and (got := file_sha256(path)) != spec.sha256:
-        raise DatasetIntegrityError(
-            f"SHA-256 is {got}, expected {spec.sha256}",
-            where=str(path),
-            hint=f"Install the package again, or give the file another name than {spec.id}",
-        )
+    if path.is_file() and spec.sha256 is not None:
+        verify_hash(path, spec.sha256, f"Install the package again, or give the file another name than {spec.id}")
