@@ -6,6 +6,7 @@ from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.bc import OfflineBC
 from sb3_dce.cql import OfflineCQL
 from sb3_dce.dce import OfflineDCE
+from sb3_dce.dce_probe import OfflineDCEProbe
 from sb3_dce.dce_variants import OfflineCQLEq18, OfflineSACV
 from sb3_dce.errors import ConfigError
 from sb3_dce.hyperparams import did_you_mean
@@ -28,6 +29,8 @@ _CLASSES: tuple[type[OfflineAlgorithm], ...] = (
     OfflineUWAC,
 )
 AGENTS: dict[str, type[OfflineAlgorithm]] = {agent.algo_name: agent for agent in _CLASSES}
+# Trained, saved and loaded like agents, but means of measurement: not offered for a choice.
+PROBES: dict[str, type[OfflineAlgorithm]] = {OfflineDCEProbe.algo_name: OfflineDCEProbe}
 
 
 def agent_class(algo: str) -> type[OfflineAlgorithm]:
@@ -36,6 +39,8 @@ def agent_class(algo: str) -> type[OfflineAlgorithm]:
     :return: class of the agent
     :raises ConfigError: for an unknown name
     """
+    if algo in PROBES:
+        return PROBES[algo]
     if algo not in AGENTS:
         raise ConfigError(
             f"unknown algorithm {algo!r}", key="algo", hint=f"{did_you_mean(algo, AGENTS)}Known: {', '.join(AGENTS)}."

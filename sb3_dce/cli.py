@@ -1,4 +1,4 @@
-"""The command line: ``sb3-dce demo | train | compare | evaluate | datasets``."""
+"""The command line: ``sb3-dce demo | train | compare | reproduce | evaluate | datasets``."""
 
 from __future__ import annotations
 
@@ -99,6 +99,67 @@ def compare(
     names = [name.strip() for name in algos.split(",") if name.strip()]
     n_workers = workers or os.cpu_count() or 1
     run_comparison(dataset, names, int(updates), range(seeds), eval_freq, eval_episodes, n_workers, out, console)
+
+
+@app.command()
+def reproduce(
+    id_: Annotated[
+        str, typer.Argument(metavar="ID", help="Experiment, several separated by commas, or [b]all[/b]; see --list.")
+    ] = "",
+    scale: Annotated[
+        str,
+        typer.Option(help="[b]smoke[/b] (a minute), [b]cpu[/b] (a night on two cores), [b]full[/b] (the paper's protocol)."),
+    ] = "smoke",
+    out: Annotated[
+        Path | None, typer.Option(show_default=False, help="Folder of the results; default runs/reproduce-<scale>.")
+    ] = None,
+    datasets: Annotated[
+        str, typer.Option(help="Only these, separated by commas, or [b]present[/b] for those that are on this machine.")
+    ] = "",
+    seeds: Annotated[int, typer.Option(min=0, show_default=False, help="Number of seeds instead of the scale's.")] = 0,
+    updates: Annotated[float, typer.Option(min=0, show_default=False, help="Gradient steps instead of the scale's.")] = 0,
+    workers: Annotated[int, typer.Option(min=0, show_default=False, help="Processes; default: one per core.")] = 0,
+    device: Annotated[
+        str, typer.Option(help="[b]cpu[/b], [b]cuda[/b] (many runs in one computation) or [b]auto[/b].")
+    ] = "auto",
+    ray_address: Annotated[
+        str | None, typer.Option(show_default=False, help="Train on a Ray cluster: auto, host:port, ray://host:port.")
+    ] = None,
+    reuse: Annotated[
+        list[Path] | None, typer.Option(show_default=False, help="Folder of result rows whose runs count as done; repeat it.")
+    ] = None,
+    import_: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--import", show_default=False, help="Folder of runs of [b]train[/b] or [b]compare[/b] to take; repeat it."
+        ),
+    ] = None,
+    report_only: Annotated[bool, typer.Option("--report-only", help="Train nothing: tables and figures from rows.")] = False,
+    page: Annotated[Path | None, typer.Option(show_default=False, help="Results page to write, Markdown.")] = None,
+    list_: Annotated[bool, typer.Option("--list", help="Show the experiments and what each needs.")] = False,
+) -> None:
+    """Make a table or figure of the paper again, beside the paper's numbers. The same command goes on after a kill."""
+    from sb3_dce.experiments import reproduce as experiments
+
+    if list_ or not id_:
+        experiments.show_list(console)
+        return
+    request = experiments.Request(
+        ids=experiments.parse_ids(id_),
+        scale=scale,
+        out=out or Path("runs") / f"reproduce-{scale}",
+        datasets=tuple(name.strip() for name in datasets.split(",") if name.strip()),
+        seeds=seeds or None,
+        updates=int(updates) or None,
+        workers=workers or os.cpu_count() or 1,
+        device=device,
+        ray_address=ray_address,
+        reuse=tuple(reuse or ()),
+        imports=tuple(import_ or ()),
+        report_only=report_only,
+        page=page,
+    )
+    experiments.reproduce(request, console)
 
 
 @app.command()

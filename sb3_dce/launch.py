@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing as mp
+import multiprocessing.connection
 import os
 import queue
 import signal
+import sys
+import threading
 import traceback
 from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -17,9 +20,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from sb3_dce import runs
-from sb3_dce.errors import SB3DCEError
+from sb3_dce.errors import DivergenceError, SB3DCEError
 from sb3_dce.evaluation import Evaluation
 from sb3_dce.runs import RunSpec
+
+# With more runs than this the bars of those that are done make room for the others.
+BARS_KEPT = 20
 
 
 class RunFailedError(SB3DCEError):
@@ -36,6 +42,23 @@ def launch(specs: Sequence[RunSpec], workers: int, console: Console) -> list[dic
     :return: results in the order of ``specs``
     :raises SB3DCEError: the first error of a run; what the others have done is kept and resumed by the same call
     """
+    return [future.result() for future in _launch(specs, workers, console, keep_going=False)]
+
+
+def launch_all(specs: Sequence[RunSpec], workers: int, console: Console) -> list[dict[str, Any] | BaseException]:
+    """
+    Run all, in parallel processes; one that fails does not stop the others.
+
+    :param specs: what is to be run
+    :param workers: processes at a time
+    :param console: where progress and evaluations are shown
+    :return: results in the order of ``specs``, or the error of the run
+    """
+    futures = _launch(specs, workers, console, keep_going=True)
+    return [future.exception() or future.result() for future in futures]
+
+
+def _launch(specs: Sequence[RunSpec], workers: int, console: Console, keep_going: bool) -> list[Future[Any]]:
     workers = max(1, min(workers, len(specs)))
     # The user's own setting wins: more threads than free cores make PyTorch many times slower.
     threads = int(os.environ.get("OMP_NUM_THREADS", 0)) or max(1, (os.cpu_count() or 1) // workers)
@@ -45,8 +68,8 @@ def launch(specs: Sequence[RunSpec], workers: int, console: Console) -> list[dic
         with ProcessPoolExecutor(workers, mp_context=context, initializer=_prepare, initargs=(threads, events)) as pool:
             futures = [pool.submit(_run, spec) for spec in specs]
             try:
-                _show_until_done(futures, events, specs, display)
-                return [future.result() for future in futures]
+                _show_until_done(futures, events, specs, display, keep_going)
+                return futures
             except BaseException:
                 # Without this an error or Ctrl-C would wait for every other run to finish.
                 for future in futures:
@@ -75,7 +98,9 @@ def progress_display(console: Console) -> Progress:
     )
 
 
-def _show_until_done(futures: list[Future[Any]], events: Any, specs: Sequence[RunSpec], display: Progress) -> None:
+def _show_until_done(
+    futures: list[Future[Any]], events: Any, specs: Sequence[RunSpec], display: Progress, keep_going: bool
+) -> None:
     tasks: dict[str, TaskID] = {}
     totals = {spec.name: spec.n_updates for spec in specs}
     while True:
@@ -83,7 +108,7 @@ def _show_until_done(futures: list[Future[Any]], events: Any, specs: Sequence[Ru
             event = events.get(timeout=0.2)
         except queue.Empty:
             failed = [future for future in futures if future.done() and future.exception() is not None]
-            if failed:
+            if failed and not keep_going:
                 failed[0].result()
             if all(future.done() for future in futures):
                 return
@@ -91,6 +116,8 @@ def _show_until_done(futures: list[Future[Any]], events: Any, specs: Sequence[Ru
         if event.name not in tasks:
             tasks[event.name] = display.add_task(event.name, total=totals[event.name])
         display.update(tasks[event.name], completed=event.n_updates)
+        if event.n_updates >= totals[event.name] and len(specs) > BARS_KEPT:
+            display.remove_task(tasks.pop(event.name))
         if event.evaluation is not None:
             show_evaluation(display.console, event.name, event.evaluation)
 
@@ -114,12 +141,40 @@ def _prepare(threads: int, events: Any) -> None:
     global _events
     _events = events
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends its workers
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     th.set_num_threads(threads)
 
 
+def _end_with_parent() -> None:
+    """A parent that was killed cannot end its workers: left alone they would write into runs that are begun again."""
+    parent = mp.parent_process()
+    assert parent is not None
+    mp.connection.wait([parent.sentinel])
+    os._exit(1)
+
+
 def _run(spec: RunSpec) -> dict[str, Any]:
+    return train_one(spec, _events.put)
+
+
+def train_one(spec: RunSpec, report: runs.Report) -> dict[str, Any]:
+    """
+    One of many runs of a process.
+
+    :param spec: what is to be run
+    :param report: called with the progress
+    :return: its result
+    :raises DivergenceError: if it diverges, which is also written down in its folder
+    :raises SB3DCEError: for other errors; the report of an unexpected one is in ``error.txt`` of the folder
+    """
+    if "torch._dynamo" in sys.modules:
+        # The update of each run counts against the compiler's limit of one function's forms, past which it gives up.
+        th.compiler.reset()
     try:
-        return runs.run(spec, _events.put)
+        return runs.run(spec, report)
+    except DivergenceError as error:
+        runs.write_divergence(Path(spec.folder), int(error.index or 0), error.what)
+        raise
     except SB3DCEError:
         raise
     except Exception as error:

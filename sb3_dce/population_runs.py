@@ -35,7 +35,7 @@ from sb3_dce.files import write_atomically
 from sb3_dce.launch import launch, progress_display, show_evaluation
 from sb3_dce.population import Population
 from sb3_dce.rollouts import Rollouts
-from sb3_dce.runs import RunSpec, read_result, refuse_other_run, write_config, write_result
+from sb3_dce.runs import RunSpec, read_result, refuse_other_run, write_config, write_divergence, write_result
 
 # Beside the members' folders: how far all have come, and the state of the common random generator.
 STATE_FILE = "population.pt"
@@ -49,6 +49,7 @@ def train_population(
     execution: str = "auto",
     workers: int = 1,
     console: Console | None = None,
+    state_file: str = STATE_FILE,
 ) -> list[dict[str, Any]]:
     """
     Train many models at once; the same call goes on with what was interrupted.
@@ -59,6 +60,8 @@ def train_population(
     :param execution: as in :class:`~sb3_dce.base.OfflineAlgorithm`
     :param workers: processes on the CPU
     :param console: where progress is shown; ``None`` shows nothing
+    :param state_file: name of the file in the common folder that says how far the population is; two populations with
+        folders of their own in one common folder need two names
     :return: results in the order of ``specs``
     :raises ConfigError: if the runs cannot be trained together
     :raises SB3DCEError: if something is wrong with data, parameters or files
@@ -67,7 +70,7 @@ def train_population(
     device = get_device(device)
     if device.type == "cpu":
         return launch(specs, workers, console)
-    return BatchedRuns(specs, device, execution, console).run()
+    return BatchedRuns(specs, device, execution, console, state_file=state_file).run()
 
 
 class BatchedRuns:
@@ -79,6 +82,7 @@ class BatchedRuns:
     :param execution: as in :class:`~sb3_dce.base.OfflineAlgorithm`
     :param console: where progress is shown
     :param own_randomness: see :class:`~sb3_dce.population.Population`
+    :param state_file: as for :func:`train_population`
     :raises ConfigError: if the runs cannot be trained together
     """
 
@@ -89,6 +93,7 @@ class BatchedRuns:
         execution: str,
         console: Console,
         own_randomness: bool = False,
+        state_file: str = STATE_FILE,
     ) -> None:
         self.specs, self.console = list(specs), console
         for name in ("algo", "n_updates", "eval_freq", "n_eval_episodes"):
@@ -107,6 +112,7 @@ class BatchedRuns:
                 hint="For example runs/gym/<dataset>-<seed>.",
             )
         self.common = parents.pop()
+        self._state_path = self.common / state_file
         for spec, folder in zip(specs, self.folders, strict=True):
             refuse_other_run(spec, folder)
         self._device, self._execution, self._own_randomness = device, execution, own_randomness
@@ -147,7 +153,7 @@ class BatchedRuns:
     # -- beginning and going on ------------------------------------------------------------------------------------
 
     def _population(self) -> Population:
-        agent, state = agent_class(self.specs[0].algo), self.common / STATE_FILE
+        agent, state = agent_class(self.specs[0].algo), self._state_path
         saved = th.load(state, weights_only=True) if state.is_file() else None
         models: list[OfflineAlgorithm] = []
         for spec, folder in zip(self.specs, self.folders, strict=True):
@@ -213,7 +219,7 @@ class BatchedRuns:
                 model.save(folder / _checkpoint(n))
         if self._diverged:
             return  # a member that cannot be saved cannot be resumed: the last whole set stays
-        with write_atomically(self.common / STATE_FILE) as stream:
+        with write_atomically(self._state_path) as stream:
             th.save({"n_updates": n, "random_state": population.random_state(), "seconds": seconds}, stream)
         for folder in self.folders:
             for path in folder.glob("checkpoint_*.zip"):
@@ -226,10 +232,12 @@ class BatchedRuns:
             if index not in self._diverged:
                 model.save(folder / "model.zip")
                 results.append(write_result(spec, folder, read_evaluations(folder, catalogue_id(model.dataset)), seconds))
-        (self.common / STATE_FILE).unlink(missing_ok=True)
+        self._state_path.unlink(missing_ok=True)
         for folder in self.folders:
             for path in folder.glob("checkpoint_*.zip"):
                 path.unlink()
+        for index, n in self._diverged.items():
+            write_divergence(self.folders[index], n, "metrics not finite")
         if self._diverged:
             names = ", ".join(f"{self.specs[index].name} (update {n:,})" for index, n in self._diverged.items())
             raise DivergenceError(

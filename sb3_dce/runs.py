@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import platform
+import shutil
+import subprocess
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -45,6 +48,7 @@ class RunSpec:
     :param eval_freq: gradient steps between two evaluations (and checkpoints)
     :param n_eval_episodes: episodes of each evaluation
     :param overrides: constructor arguments that replace those of the dataset's row
+    :param label: name for displays; empty for agent and seed
     """
 
     algo: str
@@ -55,13 +59,14 @@ class RunSpec:
     eval_freq: int = 5000
     n_eval_episodes: int = 10
     overrides: dict[str, Any] = field(default_factory=dict)
+    label: str = ""
 
     @property
     def name(self) -> str:
         """
         :return: short name for displays
         """
-        return f"{self.algo} seed {self.seed}"
+        return self.label or f"{self.algo} seed {self.seed}"
 
 
 @dataclass(frozen=True)
@@ -122,7 +127,12 @@ def run(spec: RunSpec, report: Report = lambda progress: None) -> dict[str, Any]
     started, seconds_before = time.monotonic(), _seconds_before(folder)
     remaining = spec.n_updates - model.num_timesteps
     if remaining > 0:
-        model.learn(remaining, callback=[evaluating, _ReportCallback(spec, report)], reset_num_timesteps=False)
+        model.learn(
+            remaining,
+            callback=[evaluating, _ReportCallback(spec, report)],
+            log_interval=min(1000, spec.eval_freq),
+            reset_num_timesteps=False,
+        )
     seconds = seconds_before + time.monotonic() - started
     model.save(folder / "model.zip")
     write_evaluations(folder, evaluating.evaluations)
@@ -164,8 +174,41 @@ def read_result(folder: Path) -> dict[str, Any] | None:
     return _read(folder / "result.json", json.loads)
 
 
+def write_divergence(folder: Path, n_updates: int, reason: str) -> None:
+    """
+    Write ``diverged.json``: a run that diverges is a result too, and would do the same again.
+
+    :param folder: of the run
+    :param n_updates: gradient steps before which it happened
+    :param reason: in words
+    """
+    _write_text(folder / "diverged.json", json.dumps({"n_updates": n_updates, "reason": reason}))
+
+
+def read_divergence(folder: Path) -> dict[str, Any] | None:
+    """
+    :param folder: folder of a run
+    :return: what :func:`write_divergence` wrote, ``None`` if the run has not diverged
+    :raises CheckpointError: if the file is damaged
+    """
+    return _read(folder / "diverged.json", json.loads)
+
+
+@lru_cache(maxsize=1)
+def source_commit() -> str | None:
+    """
+    :return: commit of the checkout this package is used from, ``None`` for an installed one
+    """
+    root = Path(sb3_dce.__file__).parent.parent
+    if not (root / ".git").exists() or shutil.which("git") is None:
+        return None
+    command = ["git", "-C", str(root), "rev-parse", "--short=10", "HEAD"]
+    answer = subprocess.run(command, capture_output=True, text=True)
+    return answer.stdout.strip() or None
+
+
 def _config(spec: RunSpec) -> dict[str, Any]:
-    return {key: value for key, value in asdict(spec).items() if key != "folder"}
+    return {key: value for key, value in asdict(spec).items() if key not in ("folder", "label")}
 
 
 def refuse_other_run(spec: RunSpec, folder: Path) -> None:
@@ -176,7 +219,7 @@ def refuse_other_run(spec: RunSpec, folder: Path) -> None:
     :param folder: where a run may have been begun
     :raises ConfigError: if that was another one
     """
-    config = _read(folder / "config.yml", yaml.safe_load)
+    config = read_config(folder)
     if config is None:
         return
     begun, data = (part if isinstance(part, dict) else {} for part in (config.get("run"), config.get("dataset")))
@@ -196,6 +239,15 @@ def refuse_other_run(spec: RunSpec, folder: Path) -> None:
             path=folder,
             hint=OTHER_FOLDER,
         )
+
+
+def read_config(folder: Path) -> dict[str, Any] | None:
+    """
+    :param folder: folder of a run
+    :return: its ``config.yml``, ``None`` if it has not begun
+    :raises CheckpointError: if the file is damaged
+    """
+    return _read(folder / "config.yml", yaml.safe_load)
 
 
 def _read(path: Path, parse: Callable[[str], Any]) -> dict[str, Any] | None:
@@ -255,6 +307,7 @@ def write_config(spec: RunSpec, model: OfflineAlgorithm, folder: Path) -> None:
         "hyperparameters": hyperparameters,
         "versions": {
             "sb3_dce": sb3_dce.__version__,
+            "commit": source_commit(),
             "python": platform.python_version(),
             **{name: version(name) for name in ("torch", "stable-baselines3", "gymnasium", "mujoco", "numpy")},
         },

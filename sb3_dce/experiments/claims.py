@@ -1,0 +1,125 @@
+"""The paper's claims as a list with outcomes, and what its own tables say about them (computed from its printed numbers)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from sb3_dce.experiments.evidence import Evidence
+from sb3_dce.experiments.paper import gym_rows, leaders, paper_score, paper_scores, paper_total
+from sb3_dce.experiments.statistics import sample_std
+from sb3_dce.experiments.tables import TextTable, seconds_per_1000
+from sb3_dce.experiments.verdicts import HELD, NOT_HELD, UNTESTED, Verdict, judge
+
+KITCHEN = ["kitchen-complete-v0", "kitchen-partial-v0", "kitchen-mixed-v0"]
+
+
+def claim_table(evidences: Mapping[str, Evidence], judged: Mapping[str, list[Verdict]]) -> TextTable:
+    """
+    :param evidences: by experiment
+    :param judged: verdicts by experiment
+    :return: the paper's claims C1 to C11 and their outcome on our rows
+    """
+    rows = [
+        ("C1", "the ranking of actions inside the data is little changed", UNTESTED, "no experiment of the paper shows it"),
+        ("C2", "no pre-training is needed", HELD, "by construction: no agent here is trained before DCE"),
+        ("C3", *_outcome(_faster_than_cql(evidences.get("table1")))),
+        *(_labelled(judged.get("table1", []), label) for label in ("C4", "C5", "C6")),
+        ("C7", *_outcome(_seeds_matter(evidences.get("table1")))),
+        ("C8", "state of the art", NOT_HELD, _own_total()),
+        _labelled(judged.get("table-adroit-kitchen", []), "C9"),
+        ("C10", "V alone bounds Q (V is a conservative estimate)", *_v_bound(judged.get("fig-sac", []))),
+        ("C11", "beta could be found automatically", UNTESTED, "named as future work"),
+    ]
+    caption = "Outcomes are about the data and lengths named with each table below; rules and numbers stand with the figures."
+    return TextTable(("", "claim", "outcome", "numbers"), tuple(rows), caption)
+
+
+def own_table_facts() -> TextTable:
+    """
+    :return: what the paper's printed numbers say, computed from them, and slips of the text
+    """
+    rows = gym_rows()
+    best = leaders(rows)
+    others = [row for row in rows if not row.endswith("medium-expert-v2")]
+    first = [row for row in others if best[row] == "DCE"]
+    medium = {method: paper_score("halfcheetah-medium-v2", method) for method in ("PBRL", "DCE")}
+    kitchen = paper_total("DCE", KITCHEN)
+    totals = {method: paper_total(method, rows) for method in ("BC", "PBRL", "DCE")}
+    printed = {method: paper_scores()[("gym", "mujoco-total", method)].score for method in totals}
+    random_cells = [paper_score("halfcheetah-random-v2", method) for method in ("TD3-BC", "PBRL")]
+    assert kitchen is not None and all(total is not None for total in totals.values())
+    sums = "; ".join(f"{m}: {t.mean:.1f}, printed {printed[m]:g}" for m, t in totals.items() if t is not None)
+    dce = totals["DCE"]
+    assert dce is not None
+    facts = (
+        ("M1", '"state-of-the-art"', _own_total()),
+        ("M2", "best on each HalfCheetah set", ", ".join(f"{m} {c.score:g}" for m, c in medium.items() if c) + " on medium"),
+        ("M3", "better on random, medium, medium-replay", f"DCE has the top score in {len(first)} of {len(others)} rows"),
+        ("M4", "Kitchen total of DCE, printed 156.8", f"its rows sum to {kitchen.mean:.1f}"),
+        ("M5", "Gym totals", sums),
+        ("M6", '"116.1+-9.4 18.7" (PBRL, Adroit)', "18.7, to which the row deviations sum"),
+        (
+            "M7",
+            "TD3-BC on halfcheetah-random",
+            " and ".join(f"{c.score:g} ± {c.std:g}" for c in random_cells if c is not None) + ": equal to PBRL's cell",
+        ),
+        ("M8", "Eq. 7, 9, 10, Algorithm 1", "see docs/dce.md: factor and sign of the gradient, exponents, Polyak coefficient"),
+        ("M9", "± of the totals", f"sum of the row deviations: DCE {dce.paper_std:.1f}; independent rows: {dce.std:.1f}"),
+        ("M10", "caption of the Adroit table", 'says "in the Gym" and four episodes; the text says five'),
+        ("M11", 'caption of Algorithm 1, "flexible conservative estimate"', "an older name; the expert sets were not run"),
+        ("M12", '"tau = 0.5 equals MSE"', "it equals half of it"),
+        ("M13", "baselines", "copied from other papers' protocols; only BC and IQL were run again, on the random sets"),
+        ("M14", '"quantile regression"', "expectile regression"),
+        ("M15", "not given", "density ratio, grid of tau, data of two figures, batch size, alpha of the SAC figure"),
+        ("M16", "figures", "the image files are missing: what they show is known from captions and text only"),
+    )
+    return TextTable(("", "where", "fact"), facts, "Computed from the printed cells where numbers are given.")
+
+
+def _own_total() -> str:
+    totals = {method: paper_total(method, gym_rows()) for method in ("PBRL", "DCE")}
+    return "the paper's own Gym totals: " + ", ".join(f"{m} {t.mean:.1f}" for m, t in totals.items() if t is not None)
+
+
+def _outcome(verdict: Verdict) -> tuple[str, str, str]:
+    return verdict.claim, verdict.outcome, verdict.numbers
+
+
+def _labelled(judged: list[Verdict], label: str) -> tuple[str, str, str, str]:
+    for verdict in judged:
+        labels, _, claim = verdict.claim.partition(": ")
+        if label in labels.split(", "):
+            return label, claim, verdict.outcome, verdict.numbers
+    return label, "", UNTESTED, "runs are missing"
+
+
+def _faster_than_cql(evidence: Evidence | None) -> Verdict:
+    rates = {}
+    if evidence is not None:
+        ids = [name for _, name in evidence.table_rows()]
+        found = {name: seconds_per_1000(evidence, evidence.experiment.variant(name), ids) for name in ("DCE", "CQL")}
+        rates = {name: sorted(values)[len(values) // 2] for name, values in found.items() if len(values)}
+    numbers = ", ".join(f"{name} {value:.1f} s per 1000 updates" for name, value in rates.items())
+    holds = rates["DCE"] < rates["CQL"] if len(rates) == 2 else None
+    return judge("DCE is faster than CQL", "medians of the run times", holds, numbers)
+
+
+def _seeds_matter(evidence: Evidence | None) -> Verdict:
+    spreads = {}
+    if evidence is not None:
+        dce = evidence.experiment.variant("DCE")
+        scores = {name: evidence.last(dce, name) for _, name in evidence.table_rows()}
+        spreads = {name: sample_std(values) for name, values in scores.items() if len(values) > 1}
+    numbers = ", ".join(f"{name} {value:.1f}" for name, value in sorted(spreads.items(), key=lambda item: -item[1])[:3])
+    holds = max(spreads.values()) > 10.0 if spreads else None
+    rule = "a standard deviation over seeds above 10"
+    return judge("seeds matter (paper: 12.3 on hopper-medium, 18.4 on hopper-medium-expert)", rule, holds, numbers)
+
+
+def _v_bound(judged: list[Verdict]) -> tuple[str, str]:
+    found = [verdict for verdict in judged if verdict.claim.startswith("V alone makes Q far lower")]
+    tested = [verdict for verdict in found if verdict.outcome != UNTESTED]
+    if not tested:
+        return UNTESTED, "runs are missing"
+    outcome = HELD if all(verdict.outcome == HELD for verdict in tested) else NOT_HELD
+    return outcome, "; ".join(verdict.numbers for verdict in tested)

@@ -1,0 +1,153 @@
+"""
+Runs on the nodes of a Ray cluster (extra ``[cluster]``). Nothing is shared but the network: a node finds the data by their
+id on its own disk, trains in a folder of its own cache, and sends the files of the complete run back.
+
+A node that is given an interrupted run again goes on from its checkpoint; another node begins it anew. What has arrived
+here is never run again.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich.console import Console
+
+from sb3_dce.errors import ConfigError, DivergenceError, SB3DCEError
+from sb3_dce.files import write_atomically
+from sb3_dce.runs import RunSpec
+
+# Written last: they are the marks of a complete run.
+MARKS = ("result.json", "diverged.json")
+
+
+class Outcome(NamedTuple):
+    """
+    What comes back from a node.
+
+    :param node: name of the machine
+    :param files: content by name
+    :param error: what went wrong, in words
+    :param diverged: whether that was a divergence, which is a result
+    """
+
+    node: str
+    files: dict[str, bytes]
+    error: str | None
+    diverged: bool
+
+
+def run_on_cluster(specs: Sequence[RunSpec], address: str, console: Console) -> list[BaseException]:
+    """
+    Train all runs on a cluster, one core each.
+
+    :param specs: runs that are not complete here
+    :param address: of the cluster: ``auto``, ``host:port`` of its head, or ``ray://host:port``
+    :param console: where the end of each run is shown
+    :return: errors of the runs that failed
+    :raises ConfigError: without Ray, or if no cluster answers
+    """
+    try:
+        import ray
+    except ImportError:
+        raise ConfigError(
+            "--ray-address needs Ray, which is not installed", key="--ray-address", hint='pip install "sb3_dce[cluster]"'
+        ) from None
+    begun_here = not ray.is_initialized()
+    if begun_here:
+        try:
+            ray.init(address=address, log_to_driver=False, configure_logging=False)
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise ConfigError(
+                f"no Ray cluster at {address}: {str(error).splitlines()[0]}",
+                key="--ray-address",
+                hint="Start one: ray start --head, then on each further machine: ray start --address=<head>:6379",
+            ) from error
+    try:
+        return _collect(ray, specs, console)
+    finally:
+        if begun_here:
+            ray.shutdown()
+
+
+def _collect(ray: Any, specs: Sequence[RunSpec], console: Console) -> list[BaseException]:
+    remote = ray.remote(num_cpus=1, max_retries=2, scheduling_strategy="SPREAD")(train_on_node)
+    waiting = {remote.remote(spec): spec for spec in specs}
+    failures: list[BaseException] = []
+    while waiting:
+        (ready,), _ = ray.wait(list(waiting), num_returns=1)
+        spec = waiting.pop(ready)
+        try:
+            outcome: Outcome = ray.get(ready)
+        except ray.exceptions.RayError as error:
+            failures.append(NodeError(f"{spec.name} was lost with its node: {str(error).splitlines()[0]}", hint=AGAIN))
+            continue
+        receive(Path(spec.folder), outcome.files)
+        if outcome.error is not None:
+            kind = DivergenceError if outcome.diverged else NodeError
+            failures.append(kind(f"{spec.name} on {outcome.node}: {outcome.error}", hint=None if outcome.diverged else AGAIN))
+        console.print(f"  {spec.name:<40} from {outcome.node}   {outcome.error or 'complete'}", highlight=False, markup=False)
+    return failures
+
+
+AGAIN = "The same command goes on with what is missing."
+
+
+class NodeError(SB3DCEError):
+    """A run failed on a node of the cluster."""
+
+
+def train_on_node(spec: RunSpec) -> Outcome:
+    """
+    What a node does.
+
+    :param spec: run, with the folder it has on the machine that asked for it
+    :return: its files
+    """
+    import os
+    import platform
+
+    import torch as th
+
+    from sb3_dce import launch, runs
+    from sb3_dce.data.locate import cache_folder
+
+    th.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", 0)) or 1)
+    node = os.environ.get("SB3_DCE_NODE") or platform.node()
+    folder = cache_folder().parent / "cluster" / node / Path(spec.folder).name
+    here = replace(spec, folder=str(folder))
+    try:
+        launch.train_one(here, lambda progress: None)
+    except DivergenceError as error:
+        return Outcome(node, send(folder), str(error), diverged=True)
+    except SB3DCEError as error:
+        return Outcome(node, {}, str(error), diverged=False)
+    except Exception:
+        return Outcome(node, {}, traceback.format_exc(limit=-3), diverged=False)
+    assert runs.read_result(folder) is not None
+    return Outcome(node, send(folder), None, diverged=False)
+
+
+def send(folder: Path) -> dict[str, bytes]:
+    """
+    :param folder: of a run
+    :return: content of its files by name
+    """
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+def receive(folder: Path, files: dict[str, bytes]) -> None:
+    """
+    :param folder: where a run is to be complete; the files that say so are written last
+    :param files: content by name
+    """
+    if not files:
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in sorted(files, key=lambda name: (name in MARKS, name)):
+        if Path(name).name == name:  # a node may not write elsewhere
+            with write_atomically(folder / name) as stream:
+                stream.write(files[name])

@@ -1,0 +1,132 @@
+"""
+Where DCE stays behind BC or IQL: what its own diagnostics say, and which single change of reading or setting closes the gap.
+
+This looks for causes; nothing found here is put into a results table.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sb3_dce.experiments.evidence import Evidence
+from sb3_dce.experiments.grid import Variant
+from sb3_dce.experiments.tables import TextTable
+
+# A change counts as a cause if it closes this share of the distance to the better of BC and IQL.
+SHARE = 0.5
+RIVALS = ("BC", "IQL")
+
+
+def score_of(evidence: Evidence, variant: Variant, dataset_id: str) -> float | None:
+    """
+    :param evidence: rows
+    :param variant: column
+    :param dataset_id: row
+    :return: mean of the last scores, ``None`` without runs
+    """
+    scores = evidence.last(variant, dataset_id)
+    return float(scores.mean()) if len(scores) else None
+
+
+def variant_table(evidence: Evidence) -> TextTable:
+    """
+    :param evidence: of the search for causes
+    :return: score of DCE, its rivals and its changed forms on every data set
+    """
+    variants = evidence.experiment.variants
+    rows = []
+    for _, name in evidence.table_rows():
+        scores = [score_of(evidence, v, name) for v in variants]
+        rows.append((name, *("-" if score is None else f"{score:.1f}" for score in scores), verdict_of(evidence, name)))
+    header = ("data", *(v.name for v in variants), "finding")
+    note = (
+        f"Each column after DCE changes one thing of the paper's row. A change is named as a cause if it closes at least "
+        f"{SHARE:.0%} of the distance between DCE and the better of BC and IQL."
+    )
+    return TextTable(header, tuple(rows), f"{evidence.caption([n for _, n in evidence.table_rows()])} {note}")
+
+
+def diagnostics_table(evidence: Evidence) -> TextTable:
+    """
+    :param evidence: of the search for causes
+    :return: what DCE logged on every data set
+    """
+    dce = evidence.experiment.variant("DCE")
+    rows = []
+    for _, name in evidence.table_rows():
+        if not len(evidence.runs(dce, name)):
+            continue
+        terminals, reward = (evidence.start(dce, name, f"data_{what}") for what in ("n_terminals", "reward_mean"))
+        half, end = halves(evidence, dce, name)
+        cells = [terminals, reward, lowest_margin(evidence, dce, name)]
+        cells += [evidence.tail(dce, name, m) for m in ("beta_eff", "gap_td", "q_data", "action_dist", "ent_coef")]
+        rows.append((name, *(_number(value) for value in (*cells, half, end))))
+    header = (
+        *("data", "terminals", "mean reward", "smallest survival margin", "beta_eff", "gap_td", "Q on the data"),
+        *("distance of actions", "alpha", "score at half time", "score at the end"),
+    )
+    note = (
+        "Diagnostics of DCE with the paper's row; means over the last tenth of the run where nothing else is said. The "
+        "survival margin is the mean reward less beta_eff: below 0, with terminals, ending an episode pays."
+    )
+    return TextTable(header, tuple(rows), f"{evidence.caption([n for _, n in evidence.table_rows()], [dce])} {note}")
+
+
+def verdict_of(evidence: Evidence, dataset_id: str) -> str:
+    """
+    :param evidence: of the search for causes
+    :param dataset_id: data
+    :return: in words, what the rows say about DCE's place
+    """
+    experiment = evidence.experiment
+    scores = {v.name: score_of(evidence, v, dataset_id) for v in experiment.variants}
+    dce = scores["DCE"]
+    rivals = {name: score for name in RIVALS if (score := scores[name]) is not None}
+    if dce is None or not rivals:
+        return "not tested"
+    best = max(rivals, key=rivals.__getitem__)
+    if dce >= rivals[best]:
+        return f"not behind ({best} {rivals[best]:.1f})"
+    causes = []
+    variant = experiment.variant("DCE")
+    margin = lowest_margin(evidence, variant, dataset_id)
+    if (evidence.start(variant, dataset_id, "data_n_terminals") or 0) > 0 and margin is not None and margin < 0:
+        causes.append(f"survival condition broken (margin {margin:.2f})")
+    gap = rivals[best] - dce
+    for name, score in scores.items():
+        if name not in ("DCE", *RIVALS) and score is not None and score - dce >= SHARE * gap:
+            causes.append(f"{name} closes {(score - dce) / gap:.0%}")
+    half, end = halves(evidence, variant, dataset_id)
+    if half is not None and end is not None and end - half >= SHARE * gap:
+        causes.append(f"still rising ({half:.1f} at half time)")
+    return f"behind {best} by {gap:.1f}: " + ("; ".join(causes) if causes else "none of the changes explains it")
+
+
+def lowest_margin(evidence: Evidence, variant: Variant, dataset_id: str) -> float | None:
+    """
+    :param evidence: rows
+    :param variant: DCE
+    :param dataset_id: data
+    :return: smallest survival margin of the run, reward units per step
+    """
+    curve = evidence.curve(variant, dataset_id, "survival_margin")
+    return None if curve.empty else float(np.nanmin(curve.to_numpy()))
+
+
+def halves(evidence: Evidence, variant: Variant, dataset_id: str) -> tuple[float | None, float | None]:
+    """
+    :param evidence: rows
+    :param variant: agent
+    :param dataset_id: data
+    :return: score at half of the run and at its end, each the mean of the last five evaluations until then
+    """
+    curve = evidence.curve(variant, dataset_id, "score")
+    if len(curve) < 2:
+        return None, None
+    middle = curve[curve.index <= (evidence.n_updates(dataset_id) or 0) / 2]
+    means = [None if part.empty else float(part.tail(5).mean().mean()) for part in (middle, curve)]
+    return means[0], means[1]
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3g}" if abs(value) < 1000 else f"{value:,.0f}"

@@ -1,0 +1,261 @@
+"""
+What the rows say about an experiment: scores of a table's cells, curves of a figure's lines, and where they come from.
+
+All cells of a table row come from one file: where rows of two versions of a dataset are known, those of the one with more
+runs are taken, and the others are counted as left out. All have one length, unless the caller names one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cached_property
+
+import numpy as np
+import pandas as pd
+
+from sb3_dce.experiments.grid import EMBEDDED, Experiment, GridDataset, Scale, Variant, differences, source_of, variant_hash
+from sb3_dce.theory import beta_eff, shift_factor
+
+UPDATES_PER_EPOCH = 1000
+GAMMA, TAU = 0.99, 0.005  # of all DCE runs of the figures (paper, common configuration)
+
+
+class Evidence:
+    """
+    Rows of one experiment at one scale.
+
+    :param experiment: with its datasets and variants
+    :param rows: any rows; those of other experiments count where the run is the same
+    :param scale: "smoke" has configurations of its own, the other scales share theirs
+    :param n_updates: only runs of this length; ``None`` takes for each dataset the length most of its variants have
+    """
+
+    def __init__(self, experiment: Experiment, rows: pd.DataFrame, scale: Scale, n_updates: int | None = None) -> None:
+        self.experiment, self.scale = experiment, scale
+        self._rows, self._n_updates = rows, n_updates
+        self._selected: dict[str, pd.DataFrame] = {}
+        self.left_out = 0
+
+    # -- which data ------------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _groups(self) -> dict[tuple[str, str, str], pd.DataFrame]:
+        return dict(iter(self._rows.groupby(["dataset", "agent", "config_hash"], sort=False, observed=True)))  # type: ignore[arg-type]
+
+    def ids(self, dataset: GridDataset) -> list[str]:
+        """
+        :param dataset: of the grid
+        :return: ids under which there are rows: D4RL's and our twin's are two rows of a table, never one
+        """
+        names = [EMBEDDED] if self.scale.source == "embedded" and dataset == self.experiment.datasets[0] else list(dataset.ids)
+        if self.scale.source == "embedded" and names != [EMBEDDED]:
+            return []
+        return [name for name in names if any(len(self.runs(v, name)) for v in self.variants(dataset))]
+
+    def table_rows(self) -> list[tuple[GridDataset, str]]:
+        """
+        :return: dataset of the grid and id of the data, for every row that has results
+        """
+        return [(dataset, name) for dataset in self.experiment.datasets for name in self.ids(dataset)]
+
+    def variants(self, dataset: GridDataset) -> list[Variant]:
+        """
+        :param dataset: of the grid
+        :return: those that are run on it
+        """
+        return [v for v in self.experiment.variants if v.datasets is None or dataset.paper in v.datasets]
+
+    def id_of(self, paper: str | None) -> str | None:
+        """
+        :param paper: D4RL id; ``None`` for the grid's first
+        :return: id with results that stands for it, D4RL's own before the twin; ``None`` if there is none
+        """
+        dataset = self.experiment.datasets[0] if paper is None else self.experiment.dataset(paper)
+        return next(iter(self.ids(dataset)), None)
+
+    # -- which runs ------------------------------------------------------------------------------------------------
+
+    def _of_dataset(self, dataset_id: str) -> pd.DataFrame:
+        """All runs of the experiment's variants on one file, of one length."""
+        if dataset_id in self._selected:
+            return self._selected[dataset_id]
+        keys = {(dataset_id, v.algo, variant_hash(v, dataset_id, self.scale)) for v in self.experiment.variants}
+        parts = [self._groups[key] for key in sorted(keys) if key in self._groups]
+        found = pd.concat(parts) if parts else self._rows.iloc[:0]
+        runs = found[["dataset_sha256", "agent", "config_hash", "n_updates", "seed"]].drop_duplicates()
+        if len(runs):
+            sha = _commonest(runs["dataset_sha256"])
+            ours = runs[runs["dataset_sha256"] == sha]
+            if self._n_updates is not None:
+                length = self._n_updates
+            else:
+                cells = ours.drop_duplicates(["agent", "config_hash", "n_updates"])["n_updates"].value_counts()
+                length = int(max(cells.index, key=lambda n: (cells[n], n)))
+            taken = (found["dataset_sha256"] == sha) & (found["n_updates"] == length)
+            self.left_out += int((runs["dataset_sha256"] != sha).sum())
+            found = found[taken]
+        self._selected[dataset_id] = found
+        return found
+
+    def runs(self, variant: Variant, dataset_id: str) -> pd.DataFrame:
+        """
+        :param variant: of the experiment
+        :param dataset_id: data
+        :return: rows of its runs
+        """
+        rows = self._of_dataset(dataset_id)
+        wanted = variant_hash(variant, dataset_id, self.scale)
+        return rows[(rows["agent"] == variant.algo) & (rows["config_hash"] == wanted)]
+
+    def n_updates(self, dataset_id: str) -> int | None:
+        """
+        :param dataset_id: data
+        :return: length of its runs, gradient steps
+        """
+        rows = self._of_dataset(dataset_id)
+        return int(rows["n_updates"].iloc[0]) if len(rows) else None
+
+    # -- numbers ---------------------------------------------------------------------------------------------------
+
+    def last(self, variant: Variant, dataset_id: str, metric: str = "score") -> np.ndarray:
+        """
+        :param variant: of the experiment
+        :param dataset_id: data
+        :param metric: name
+        :return: its value at the end of each complete run, in the order of the seeds
+        """
+        rows = self.runs(variant, dataset_id)
+        rows = rows[(rows["metric"] == metric) & (rows["step"] == rows["n_updates"])]
+        return rows.sort_values("seed")["value"].to_numpy(dtype=float)
+
+    def start(self, variant: Variant, dataset_id: str, metric: str) -> float | None:
+        """
+        :param variant: of the experiment
+        :param dataset_id: data
+        :param metric: name of a fact about the data
+        :return: its value
+        """
+        rows = self.runs(variant, dataset_id)
+        values = rows[(rows["metric"] == metric) & (rows["step"] == 0)]["value"]
+        return float(values.iloc[0]) if len(values) else None
+
+    def n_diverged(self, variant: Variant, dataset_id: str) -> int:
+        """
+        :param variant: of the experiment
+        :param dataset_id: data
+        :return: runs that diverged
+        """
+        rows = self.runs(variant, dataset_id)
+        return int((rows["metric"] == "diverged").sum())
+
+    def curve(self, variant: Variant, dataset_id: str, metric: str) -> pd.DataFrame:
+        """
+        :param variant: of the experiment
+        :param dataset_id: data
+        :param metric: name
+        :return: one column per seed, indexed by gradient steps
+        """
+        rows = self.runs(variant, dataset_id)
+        rows = rows[(rows["metric"] == metric) & (rows["step"] > 0)]
+        return rows.pivot(index="step", columns="seed", values="value").sort_index()
+
+    def tail(self, variant: Variant, dataset_id: str, metric: str, share: float = 0.1) -> float | None:
+        """
+        :param variant: of the experiment
+        :param dataset_id: data
+        :param metric: name
+        :param share: of the run that counts, from its end
+        :return: mean over this part and over seeds; ``None`` without values
+        """
+        curve = self.curve(variant, dataset_id, metric)
+        if curve.empty:
+            return None
+        n = self.n_updates(dataset_id) or 0
+        late = curve[curve.index > (1.0 - share) * n]
+        return float(np.nanmean((late if len(late) else curve.tail(1)).to_numpy()))
+
+    # -- theory ----------------------------------------------------------------------------------------------------
+
+    def shift(
+        self, variant: Variant, reference: Variant, dataset_id: str, of: str = "q_data"
+    ) -> tuple[pd.DataFrame, pd.Series]:
+        """
+        How far the penalty has lowered Q (or V) on the data, and how far it should have by theory.
+
+        :param variant: with a constant beta
+        :param reference: the same with beta 0
+        :param dataset_id: data
+        :param of: "q_data" or "value"
+        :return: reference minus variant, one column per common seed; theory's value at the same steps, reward units
+        """
+        lowered = self.curve(reference, dataset_id, of) - self.curve(variant, dataset_id, of)
+        lowered = lowered.dropna(how="all").dropna(axis=1, how="all")
+        unit = self.beta_eff(variant, dataset_id)
+        steps = np.asarray(lowered.index, dtype=int)
+        width = int(steps[0]) if len(steps) else 0
+        # logged values are means over the interval before the step
+        factors = np.array([shift_factor(max(1, int(step - width / 2)), GAMMA, TAU) for step in steps])
+        expected = unit * factors if of == "q_data" else unit * (factors - 1.0) / GAMMA
+        return lowered, pd.Series(expected, index=lowered.index, dtype=float)
+
+    def beta_eff(self, variant: Variant, dataset_id: str) -> float:
+        """
+        :param variant: of DCE with a constant beta
+        :param dataset_id: data
+        :return: shift per Bellman step, reward units
+        """
+        from sb3_dce import hyperparams
+
+        row = hyperparams.split_row(hyperparams.load_row(variant.algo, dataset_id)).kwargs
+        settings = {"td_loss_coef": 1.0, "beta": 4.0, **row, **variant.set}
+        return beta_eff(settings["beta"], settings["td_loss_coef"])
+
+    # -- captions --------------------------------------------------------------------------------------------------
+
+    def caption(self, dataset_ids: Iterable[str], variants: Iterable[Variant] | None = None) -> str:
+        """
+        :param dataset_ids: data shown
+        :param variants: agents shown; ``None`` for all
+        :return: where the numbers come from: data with hash, length, seeds, code
+        """
+        ids = list(dict.fromkeys(dataset_ids))
+        shown = list(self.experiment.variants if variants is None else variants)
+        parts = [self.runs(v, name) for name in ids for v in shown]
+        rows = pd.concat([part for part in parts if len(part)]) if any(len(part) for part in parts) else self._rows.iloc[:0]
+        if rows.empty:
+            return "No data."
+        data = []
+        for name in ids:
+            hashes = rows[rows["dataset"] == name]["dataset_sha256"].unique()
+            if len(hashes):
+                source = "D4RL" if source_of(name) == "D4RL" else "made with this package, not D4RL's"
+                data.append(f"`{name}` ({source}; sha256 {', '.join(h[:8] for h in hashes)}…)")
+        lengths = sorted(rows["n_updates"].unique())
+        seeds = rows.drop_duplicates(["dataset", "agent", "config_hash", "seed"])
+        counts = sorted(seeds.groupby(["dataset", "agent", "config_hash"], observed=True).size().unique())
+        episodes = sorted(rows[rows["metric"] == "n_episodes"]["value"].astype(int).unique())
+        small = "Smoke scale: tiny data, networks and lengths; the numbers say nothing about the agents. "
+        text = small if self.scale.source == "embedded" else ""
+        text += f"Data: {'; '.join(data)}. Gradient steps: {_listed(lengths)}; seeds: {_listed(counts)}; last policy"
+        text += f", {_listed(episodes)} episodes" if episodes else ""
+        text += f". Code {', '.join(sorted(rows['code_version'].unique()))} on {', '.join(sorted(rows['device'].unique()))}."
+        return text
+
+
+def hyperparameters_text(variant: Variant, dataset_id: str) -> str:
+    """
+    :param variant: of a grid
+    :param dataset_id: data
+    :return: what differs from the dataset's row, for a footnote
+    """
+    return differences(variant.algo, dataset_id, variant.set)
+
+
+def _commonest(values: pd.Series) -> str:
+    counts = values.value_counts()
+    return str(min(counts.index, key=lambda value: (-counts[value], value)))
+
+
+def _listed(numbers: Iterable[int]) -> str:
+    found = [f"{int(n):,}" for n in numbers]
+    return found[0] if len(found) == 1 else f"{found[0]} to {found[-1]}" if found else "-"

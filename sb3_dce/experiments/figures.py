@@ -1,0 +1,142 @@
+"""Figures made from rows, with the paper's axes: epochs (1000 gradient steps) against return, Q, gap or alpha."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from sb3_dce.dce_probe import PROBE_BETAS
+from sb3_dce.errors import ConfigError
+from sb3_dce.experiments.evidence import UPDATES_PER_EPOCH, Evidence
+from sb3_dce.experiments.grid import Panel, Variant
+
+LABELS = {
+    "score": "normalised score",
+    "q_data": "mean Q on the data",
+    "gap_td": r"Q - (r + $\gamma$V - $\beta_{eff}$): gap_td",
+    "gap_ref": r"$Q_\beta$ - $Q_0$ + F(n) $\beta_{eff}$: gap_ref",
+    "ent_coef": r"$\alpha$",
+    "q_shift": r"$Q_0$ - $Q_\beta$ on the data",
+    "v_shift": r"$V_0$ - $V_\beta$ on the data",
+    "probe_policy": r"$Q_\beta(s, a_\pi)$ - $Q_0(s, a_\pi)$",
+    "probe_max": "max OOD Q - in-data Q",
+    "probe_min": "min OOD Q - in-data Q",
+}
+WIDTH, HEIGHT, COLUMNS = 4.6, 3.6, 3
+
+
+def draw(evidence: Evidence, folder: Path, name: str) -> list[Path]:
+    """
+    :param evidence: of an experiment with panels
+    :param folder: where the pictures are written
+    :param name: of the files, without ending
+    :return: PNG and SVG file
+    :raises ConfigError: without matplotlib
+    """
+    try:
+        from matplotlib import rc_context
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise ConfigError("figures need matplotlib", key="matplotlib", hint='pip install "sb3_dce[plots]"') from None
+    panels = evidence.experiment.panels
+    if evidence.scale.source == "embedded":
+        first = evidence.experiment.datasets[0].paper
+        panels = tuple(p for p in panels if p.dataset in (None, first))
+    columns = min(COLUMNS, len(panels))
+    lines = -(-len(panels) // columns)
+    # fixed identifiers: the same rows give the same file
+    with rc_context({"svg.hashsalt": name}):
+        figure = Figure(figsize=(WIDTH * columns, HEIGHT * lines), layout="constrained")
+        for number, panel in enumerate(panels):
+            _panel(evidence, panel, figure.add_subplot(lines, columns, number + 1))
+        folder.mkdir(parents=True, exist_ok=True)
+        paths = [folder / f"{name}.{ending}" for ending in ("png", "svg")]
+        for path in paths:
+            metadata = {"Software": None} if path.suffix == ".png" else {"Date": None, "Creator": None}
+            figure.savefig(path, dpi=110, metadata=metadata)
+    return paths
+
+
+def panel_curves(evidence: Evidence, panel: Panel) -> dict[str, tuple[pd.DataFrame, pd.Series | None]]:
+    """
+    :param evidence: rows
+    :param panel: picture
+    :return: by line its curves (steps by seeds) and, where there is one, what theory expects; lines without data are left out
+    """
+    experiment = evidence.experiment
+    names = panel.variants or tuple(v.name for v in experiment.variants)
+    curves: dict[str, tuple[pd.DataFrame, pd.Series | None]] = {}
+    if panel.over:
+        for paper in panel.over:
+            dataset_id = evidence.id_of(paper)
+            if dataset_id is not None:
+                curves[dataset_id] = (evidence.curve(experiment.variant(names[0]), dataset_id, panel.metric), None)
+    else:
+        dataset_id = evidence.id_of(panel.dataset)
+        if dataset_id is None:
+            return {}
+        if panel.lines:
+            probe = experiment.variant(names[0])
+            curves = {f"beta {b}": (probe_difference(evidence, probe, dataset_id, panel.metric, b), None) for b in panel.lines}
+        else:
+            for name in names:
+                curves[name] = _line(evidence, panel, experiment.variant(name), dataset_id)
+    return {name: (curve, theory) for name, (curve, theory) in curves.items() if curve.notna().any(axis=None)}
+
+
+def probe_difference(evidence: Evidence, probe: Variant, dataset_id: str, metric: str, beta: int) -> pd.DataFrame:
+    """
+    :param evidence: rows of the probe
+    :param probe: its variant
+    :param dataset_id: data
+    :param metric: "probe_policy" (against the critics with beta 0), "probe_max" or "probe_min" (against the data's actions)
+    :param beta: of the critics, one of ``PROBE_BETAS`` or 0
+    :return: difference of Q, steps by seeds
+    """
+    assert beta in (0, *PROBE_BETAS)
+    if metric == "probe_policy":
+        return evidence.curve(probe, dataset_id, f"probe{beta}_policy") - evidence.curve(probe, dataset_id, "probe0_policy")
+    kind = metric.removeprefix("probe_")
+    return evidence.curve(probe, dataset_id, f"probe{beta}_{kind}") - evidence.curve(probe, dataset_id, f"probe{beta}_data")
+
+
+def _line(evidence: Evidence, panel: Panel, variant: Variant, dataset_id: str) -> tuple[pd.DataFrame, pd.Series | None]:
+    if panel.reference is None:
+        return evidence.curve(variant, dataset_id, panel.metric), None
+    reference = evidence.experiment.variant(panel.reference)
+    of = "value" if panel.metric == "v_shift" else "q_data"
+    lowered, theory = evidence.shift(variant, reference, dataset_id, of)
+    if panel.metric == "gap_ref":
+        return -lowered.sub(theory, axis=0), None
+    return lowered, theory
+
+
+def _panel(evidence: Evidence, panel: Panel, axes: object) -> None:
+    from matplotlib.axes import Axes
+
+    assert isinstance(axes, Axes)
+    curves = panel_curves(evidence, panel)
+    for number, (name, (curve, theory)) in enumerate(curves.items()):
+        color, epochs = f"C{number}", np.asarray(curve.index) / UPDATES_PER_EPOCH
+        if curve.shape[1] > 1:
+            axes.plot(epochs, curve.to_numpy(), color=color, alpha=0.25, linewidth=0.7)
+        label = f"{name} ({curve.shape[1]} seeds)" if curve.shape[1] > 1 else name
+        axes.plot(epochs, curve.mean(axis=1).to_numpy(), color=color, linewidth=1.6, label=label)
+        if theory is not None:
+            axes.plot(epochs, theory.to_numpy(), color=color, linestyle="--", linewidth=1.0, label=f"{name}, theory")
+    axes.set_xlabel("epoch (1000 gradient steps)")
+    axes.set_ylabel(LABELS[panel.metric], fontsize=9)
+    shown = None if panel.over else evidence.id_of(panel.dataset)
+    title = ", ".join(part for part in (shown or panel.dataset, panel.title) if part)
+    axes.set_title(title, fontsize=10)
+    if panel.metric in ("gap_td", "gap_ref"):
+        axes.axhline(0.0, color="0.4", linewidth=0.8)
+    if panel.scale != "linear":
+        axes.set_yscale(panel.scale)
+    axes.grid(alpha=0.3)
+    if curves:
+        axes.legend(fontsize=7)
+    else:
+        axes.text(0.5, 0.5, "no data", ha="center", va="center", transform=axes.transAxes, color="0.4")

@@ -1,0 +1,420 @@
+"""
+Declarative grids: which agents with which hyperparameters are trained on which data, how long, with which seeds.
+
+A grid names the paper's datasets. A scale decides which file stands for each: our ``-sb3`` twin, D4RL's own where it is
+present, or the embedded data. A run is known by what it is, not by the experiment that asked for it: two experiments with
+a run in common share it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_dce import hyperparams
+from sb3_dce.agents import agent_class
+from sb3_dce.data.catalog import resolve
+from sb3_dce.data.locate import search
+from sb3_dce.errors import ConfigError, DatasetNotFoundError
+from sb3_dce.runs import RunSpec
+
+SCALES = ("smoke", "cpu", "full")
+EMBEDDED = "halfcheetah-tiny-sb3"
+# Parameters that say where and how fast an agent is trained, or that have a column of their own; they make no other run.
+NOT_HYPERPARAMETERS = frozenset(
+    {"dataset", "seed", "policy", "device", "execution", "verbose", "tensorboard_log", "stats_window_size", "gradient_steps"}
+)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """
+    One agent with its hyperparameters: a column of a table or a line of a figure.
+
+    :param name: heading
+    :param algo: name of the agent
+    :param set: constructor arguments that replace those of the dataset's row
+    :param paper: method in the paper's tables, if it is there
+    :param datasets: the paper's datasets it is run on; ``None`` for all of the grid
+    :param best_policy_of: variant whose last policy the probe of out-of-distribution actions needs first
+    """
+
+    name: str
+    algo: str
+    set: dict[str, Any] = field(default_factory=dict)
+    paper: str | None = None
+    datasets: tuple[str, ...] | None = None
+    best_policy_of: str | None = None
+
+
+@dataclass(frozen=True)
+class GridDataset:
+    """
+    A dataset of the paper and what may stand for it.
+
+    :param paper: D4RL id in the paper's tables
+    :param twin: our own data that stand for it; ``None`` where there are none
+    :param note: how these differ in kind
+    """
+
+    paper: str
+    twin: str | None = None
+    note: str | None = None
+
+    @property
+    def ids(self) -> tuple[str, ...]:
+        """
+        :return: ids under which results of this row may be found, the paper's first
+        """
+        return (self.paper,) if self.twin is None else (self.paper, self.twin)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """
+    One picture of a figure.
+
+    :param metric: what is drawn over epochs
+    :param dataset: the paper's dataset; ``None`` for the first of the grid
+    :param variants: lines; empty for all of the grid
+    :param over: draw one line per dataset of this list instead, of the one variant
+    :param lines: values of beta of the probe's critics, one line each
+    :param reference: variant whose values are subtracted
+    :param title: addition to the heading
+    :param scale: of the y axis
+    """
+
+    metric: str
+    dataset: str | None = None
+    variants: tuple[str, ...] = ()
+    over: tuple[str, ...] = ()
+    lines: tuple[int, ...] = ()
+    reference: str | None = None
+    title: str | None = None
+    scale: str = "linear"
+
+
+@dataclass(frozen=True)
+class Scale:
+    """
+    How much is run.
+
+    :param source: "embedded", "twin", or "d4rl" (D4RL's file where it is present, else the twin)
+    :param updates: gradient steps
+    :param eval_freq: gradient steps between two evaluations
+    :param episodes: of each evaluation
+    :param seeds: number of seeds, 0 upwards
+    :param set: constructor arguments of all agents that have them
+    :param set_for: constructor arguments by agent
+    """
+
+    source: str
+    updates: int
+    eval_freq: int
+    episodes: int
+    seeds: int
+    set: dict[str, Any] = field(default_factory=dict)
+    set_for: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """
+    One item of the paper.
+
+    :param id: name on the command line
+    :param title: heading
+    :param items: numbers in the list of experiments
+    :param report: "table", "figure", "bounds", "diagnosis" or "configuration"
+    :param datasets: rows, in the paper's order
+    :param variants: columns or lines
+    :param panels: pictures
+    :param scales: by name
+    """
+
+    id: str
+    title: str
+    items: tuple[str, ...]
+    report: str
+    datasets: tuple[GridDataset, ...]
+    variants: tuple[Variant, ...]
+    panels: tuple[Panel, ...]
+    scales: dict[str, Scale]
+
+    def dataset(self, paper: str) -> GridDataset:
+        """
+        :param paper: D4RL id
+        :return: the entry
+        """
+        return next(d for d in self.datasets if d.paper == paper)
+
+    def variant(self, name: str) -> Variant:
+        """
+        :param name: heading
+        :return: the entry
+        """
+        return next(v for v in self.variants if v.name == name)
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """
+    A run of a grid.
+
+    :param experiment: id of the experiment
+    :param variant: name of the variant
+    :param row: the paper's dataset whose place it has
+    :param spec: what is run
+    :param config: hash of its configuration
+    :param needs: folder of the run whose last policy it needs
+    """
+
+    experiment: str
+    variant: str
+    row: str
+    spec: RunSpec
+    config: str
+    needs: str | None = None
+
+    @property
+    def key(self) -> tuple[str, str, str, int, int]:
+        """
+        :return: dataset, agent, configuration, length and seed, as in the rows
+        """
+        return self.spec.dataset, self.spec.algo, self.config, self.spec.n_updates, self.spec.seed
+
+
+def experiment_ids() -> list[str]:
+    """
+    :return: names of all experiments, those with runs of table 1 first
+    """
+    order = ["table1", "table-adroit-kitchen", "fig-tau", "fig-beta", "fig-ood", "fig-alpha", "fig-cql-q", "fig-cql-return"]
+    order += ["fig-sac", "fig-alpha-return", "bounds", "config-tables", "why-dce-loses"]
+    names = {e.name.removesuffix(".yml") for e in _grids().iterdir() if e.name.endswith(".yml")} - {"scales"}
+    return sorted(names, key=lambda name: order.index(name) if name in order else len(order))
+
+
+def load_experiment(experiment_id: str) -> Experiment:
+    """
+    :param experiment_id: name on the command line
+    :return: the experiment
+    :raises ConfigError: for an unknown name
+    """
+    known = experiment_ids()
+    if experiment_id not in known:
+        hint = f"{hyperparams.did_you_mean(experiment_id, known)}Known: {', '.join(known)}."
+        raise ConfigError(f"no experiment {experiment_id!r}", key="id", hint=hint)
+    grid = _read(f"{experiment_id}.yml")
+    defaults = _read("scales.yml")
+    changes = grid.get("scales", {})
+    return Experiment(
+        id=experiment_id,
+        title=grid["title"],
+        items=tuple(grid["items"]),
+        report=grid["report"],
+        datasets=tuple(GridDataset(**d) for d in grid.get("datasets", ())),
+        variants=tuple(Variant(**_tuples(v)) for v in grid.get("variants", ())),
+        panels=tuple(Panel(**_tuples(p)) for p in grid.get("panels", ())),
+        scales={name: Scale(**{**defaults[name], **changes.get(name, {})}) for name in SCALES},
+    )
+
+
+def expand(
+    experiment: Experiment,
+    scale: Scale,
+    root: Path,
+    datasets: Sequence[str] | None = None,
+    seeds: Iterable[int] | None = None,
+) -> list[PlannedRun]:
+    """
+    All runs of an experiment, those that others need first.
+
+    :param experiment: what is made
+    :param scale: how much of it
+    :param root: folder below which the runs have their folders
+    :param datasets: only these of its datasets, by any of their ids; ``None`` for all
+    :param seeds: instead of those of the scale
+    :return: runs; a dataset for which there can be no data (Kitchen without D4RL's files) has none
+    :raises ConfigError: if one of ``datasets`` is not in the grid
+    :raises DatasetNotFoundError: if a file is missing; the message names the command that makes it
+    """
+    chosen = _chosen(experiment, datasets)
+    numbers = range(scale.seeds) if seeds is None else list(seeds)
+    if scale.source == "embedded":
+        chosen = chosen[:1]
+    planned = []
+    for dataset in chosen:
+        file_id = _file_of(dataset, scale.source, asked_for=datasets is not None)
+        if file_id is None:
+            continue
+        for seed in numbers:  # all agents of a seed before the next: what is interrupted is a smaller table
+            for variant in experiment.variants:
+                if variant.datasets is not None and dataset.paper not in variant.datasets:
+                    continue
+                spec = _spec(variant, file_id, seed, scale, root)
+                needs = None
+                if variant.best_policy_of is not None:
+                    needs = _spec(experiment.variant(variant.best_policy_of), file_id, seed, scale, root).folder
+                config = variant_hash(variant, file_id, scale)
+                planned.append(PlannedRun(experiment.id, variant.name, dataset.paper, spec, config, needs))
+    return planned
+
+
+def differences(algo: str, dataset_id: str | None, overrides: dict[str, Any]) -> str:
+    """
+    Hyperparameters of a run as a text that is the same however the run was asked for.
+
+    :param algo: name of the agent
+    :param dataset_id: id of the catalogue, whose row of the hyperparameter file applies
+    :param overrides: constructor arguments that replace those of the row
+    :return: JSON of those that differ from the row and, where it is silent, from the constructor's defaults
+    """
+    in_force = {**_defaults(algo), **hyperparams.split_row(hyperparams.load_row(algo, dataset_id)).kwargs}
+    return _json({k: v for k, v in overrides.items() if k not in NOT_HYPERPARAMETERS and in_force.get(k) != v})
+
+
+def config_hash(algo: str, hyperparameters: dict[str, Any]) -> str:
+    """
+    What a run is apart from data, seed and length. A parameter that is added later, with a default that changes nothing,
+    leaves it as it is; a changed row of a hyperparameter file does not.
+
+    :param algo: name of the agent
+    :param hyperparameters: constructor arguments in force
+    :return: 12 hexadecimal digits, of those that differ from the constructor's defaults
+    """
+    defaults = _defaults(algo)
+    counted = {k: v for k, v in hyperparameters.items() if k in defaults and k not in NOT_HYPERPARAMETERS}
+    differing = {k: v for k, v in counted.items() if v != defaults[k] and not (k == "policy_kwargs" and not v)}
+    return hashlib.sha256(f"{algo} {_json(differing)}".encode()).hexdigest()[:12]
+
+
+def variant_hash(variant: Variant, dataset_id: str, scale: Scale | None = None) -> str:
+    """
+    :param variant: of a grid
+    :param dataset_id: data it is run on
+    :param scale: adds its own arguments
+    :return: hash of the run's configuration, as it stands in the rows
+    """
+    row = hyperparams.split_row(hyperparams.load_row(variant.algo, dataset_id)).kwargs
+    return config_hash(variant.algo, {**_defaults(variant.algo), **row, **_overrides(variant, scale)})
+
+
+def _defaults(algo: str) -> dict[str, Any]:
+    return {name: p.default for name, p in inspect.signature(agent_class(algo)).parameters.items() if name[0] != "_"}
+
+
+def source_of(dataset_id: str) -> str:
+    """
+    :param dataset_id: id of the catalogue
+    :return: "D4RL" or "sb3" (made with this package)
+    """
+    return "sb3" if resolve(dataset_id).generated else "D4RL"
+
+
+def _overrides(variant: Variant, scale: Scale | None) -> dict[str, Any]:
+    if scale is None:
+        return dict(variant.set)
+    known = inspect.signature(agent_class(variant.algo)).parameters
+    common = {key: value for key, value in scale.set.items() if key in known}
+    return {**common, **scale.set_for.get(variant.algo, {}), **variant.set}
+
+
+def _spec(variant: Variant, dataset_id: str, seed: int, scale: Scale, root: Path) -> RunSpec:
+    overrides = json.loads(differences(variant.algo, dataset_id, _overrides(variant, scale)))
+    digest = variant_hash(variant, dataset_id, scale)
+    name = f"{variant.algo}--{digest}--{scale.updates}x{scale.eval_freq}x{scale.episodes}"
+    folder = root / f"{dataset_id}--{name}--seed_{seed}"
+    label = f"{variant.algo} {digest[:4]} {dataset_id} seed {seed}"
+    n, every = scale.updates, scale.eval_freq
+    return RunSpec(variant.algo, dataset_id, seed, n, str(folder), every, scale.episodes, overrides, label)
+
+
+def _chosen(experiment: Experiment, datasets: Sequence[str] | None) -> list[GridDataset]:
+    if datasets is None:
+        return list(experiment.datasets)
+    by_id = {name: d for d in experiment.datasets for name in d.ids}
+    wanted = [resolve(name).id for name in datasets]
+    for name in wanted:
+        if name not in by_id:
+            raise ConfigError(f"{experiment.id} has no dataset {name!r}", key="--datasets", hint=f"It has {', '.join(by_id)}.")
+    return [d for d in experiment.datasets if any(by_id[name] is d for name in wanted)]
+
+
+def _file_of(dataset: GridDataset, source: str, asked_for: bool) -> str | None:
+    """Id of the data that stand for a dataset, None where none can be had without D4RL's file."""
+    if source == "embedded":
+        return EMBEDDED
+    if source == "d4rl" and search(resolve(dataset.paper)) is not None:
+        return dataset.paper
+    if dataset.twin is not None and search(resolve(dataset.twin)) is not None:
+        return dataset.twin
+    if dataset.twin is None:
+        if source == "twin" and search(resolve(dataset.paper)) is not None:
+            return dataset.paper  # there is no twin to prefer
+        if not asked_for:
+            return None
+        raise DatasetNotFoundError(
+            f"no data: {dataset.paper} has no twin of our own and D4RL's file is not here",
+            where=dataset.paper,
+            key=dataset.paper,
+            hint=f"Run: sb3-dce datasets download {dataset.paper}",
+        )
+    raise DatasetNotFoundError(
+        "the file is not here",
+        where=f"dataset {dataset.twin}",
+        key=dataset.twin,
+        hint=f"Run: sb3-dce datasets generate {dataset.twin} - or take those that are here with --datasets, or all of them "
+        "with --datasets present",
+    )
+
+
+def present_datasets(experiment: Experiment, scale: Scale) -> list[str]:
+    """
+    :param experiment: with its datasets
+    :param scale: decides which file is looked for
+    :return: the paper's ids of those whose data are on this machine
+    """
+    found = []
+    for dataset in experiment.datasets:
+        try:
+            file_id = _file_of(dataset, scale.source, asked_for=False)
+        except DatasetNotFoundError:
+            continue
+        if file_id is not None:
+            found.append(dataset.paper)
+    return found
+
+
+def _json(values: dict[str, Any]) -> str:
+    return json.dumps(_plain_numbers(values), sort_keys=True, separators=(",", ":"))
+
+
+def _plain_numbers(value: Any) -> Any:
+    """2 and 2.0 are the same hyperparameter."""
+    if isinstance(value, dict):
+        return {key: _plain_numbers(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain_numbers(item) for item in value]
+    if isinstance(value, float) and value.is_integer():
+        return int(value)
+    return value
+
+
+def _tuples(entry: dict[str, Any]) -> dict[str, Any]:
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in entry.items()}
+
+
+def _grids() -> Any:
+    return resources.files("sb3_dce.experiments") / "grids"
+
+
+def _read(name: str) -> dict[str, Any]:
+    return yaml.safe_load((_grids() / name).read_text(encoding="utf-8"))

@@ -1,0 +1,81 @@
+"""The results page, Markdown, from the reports of all experiments; nothing on it is typed by hand."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from sb3_dce.experiments.claims import claim_table, own_table_facts
+from sb3_dce.experiments.evidence import Evidence
+from sb3_dce.experiments.reports import Report, count
+from sb3_dce.experiments.tables import TextTable
+from sb3_dce.experiments.verdicts import Verdict
+from sb3_dce.files import write_atomically
+
+HEADINGS = {
+    "scores": "Normalised scores",
+    "aggregates-D4RL": "Aggregates, D4RL's data",
+    "aggregates-sb3": "Aggregates, our own data",
+    "run-times": "Run times",
+    "bounds": "Bounds (Eq. 14 to 17)",
+    "claim-4.3": "Claim 4.3 on a linear critic",
+    "changes": "One change at a time",
+    "diagnostics": "Diagnostics",
+    "rows": "The 23 rows",
+    "common": "Common configuration",
+}
+
+
+def write_page(path: Path, out: Path, evidences: Mapping[str, Evidence], reports: Mapping[str, Report], command: str) -> None:
+    """
+    :param path: page to write
+    :param out: folder with ``figures/`` and ``tables/``, linked from the page
+    :param evidences: by experiment
+    :param reports: by experiment
+    :param command: by which the page is made again
+    """
+    link = Path(os.path.relpath(out.resolve(), path.resolve().parent)).as_posix()
+    link = "" if link == "." else f"{link}/"
+    judged = {name: report.verdicts for name, report in reports.items()}
+    every = [verdict for found in judged.values() for verdict in found]
+    parts = [
+        "# Results",
+        f"Made from the result rows in `{link}rows/` by `{command}`; nothing here is typed by hand.",
+        "Data whose names end in `-sb3` are made with this package. They stand in for D4RL's sets and are not these: scores "
+        "on them cannot be compared with published ones, which stand beside them in columns of their own, under the D4RL id they "
+        "belong to. Scores are those of the last policy, with D4RL's constants, in the version 4 environments.",
+        f"Verdicts: {count(every)}.",
+        "## The paper's claims",
+        claim_table(evidences, judged).markdown(),
+        "## What the paper's own tables say",
+        own_table_facts().markdown(),
+    ]
+    for name, report in reports.items():
+        parts += _section(name, evidences[name], report, link)
+    with write_atomically(path) as stream:
+        stream.write("\n\n".join(part.strip("\n") for part in parts).encode() + b"\n")
+
+
+def _section(name: str, evidence: Evidence, report: Report, link: str) -> list[str]:
+    experiment = evidence.experiment
+    parts = [f"## {experiment.title}", f"`sb3-dce reproduce {name}` ({', '.join(experiment.items)})."]
+    for table_name, table in report.tables.items():
+        if table_name in HEADINGS:
+            parts += [f"### {HEADINGS[table_name]}", table.markdown()]
+    if report.has_figure:
+        parts += [f"![{experiment.title}]({link}figures/{name}.png)", report.caption]
+    if report.verdicts:
+        parts.append(verdict_table(report.verdicts).markdown())
+    if "long" in report.tables:
+        parts.append(f"Per agent and data, with seeds and intervals: [{name}-long.csv]({link}tables/{name}-long.csv).")
+    return parts
+
+
+def verdict_table(judged: list[Verdict]) -> TextTable:
+    """
+    :param judged: verdicts
+    :return: as a table
+    """
+    rows = tuple((v.claim, f"**{v.outcome}**", v.numbers, v.rule) for v in judged)
+    return TextTable(("claim", "outcome", "numbers", "rule"), rows, "")

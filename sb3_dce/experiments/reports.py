@@ -1,0 +1,199 @@
+"""From the rows of an experiment to its report: tables, figure, caption and verdicts."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_dce import hyperparams
+from sb3_dce.dce import OfflineDCE
+from sb3_dce.experiments import diagnosis, tables
+from sb3_dce.experiments.evidence import Evidence
+from sb3_dce.experiments.grid import source_of
+from sb3_dce.experiments.paper import paper_score, read_csv
+from sb3_dce.experiments.statistics import bootstrap_interval
+from sb3_dce.experiments.tables import TextTable
+from sb3_dce.experiments.verdicts import HELD, UNTESTED, Verdict, judge, verdicts
+from sb3_dce.schedules import StepSchedule
+from sb3_dce.theory import penalty_bound, sampling_bound, upper_bound
+
+# Of the paper's common configuration, with the reading where it prints none.
+COMMON = (
+    ("learning rate of Q, V and actor", "3e-4", "learning_rate"),
+    ("gamma", "0.99", "gamma"),
+    ("expectile (tau)", "0.7", "expectile"),
+    ("Polyak coefficient (upsilon)", "0.005", "tau"),
+    ("hidden layers", "256, 256", "policy_kwargs"),
+    ("batch size", "not printed", "batch_size"),
+    ("interval of the changes of beta, epochs", "50", "beta_update_every"),
+    ("gradient steps per epoch", "1000 (500 epochs are 500,000 gradients)", "steps_per_epoch"),
+)
+
+
+class Report(NamedTuple):
+    """
+    :param tables: by name
+    :param has_figure: whether its panels are to be drawn
+    :param caption: of the figure
+    :param verdicts: on the paper's claims
+    """
+
+    tables: dict[str, TextTable]
+    has_figure: bool
+    caption: str
+    verdicts: list[Verdict]
+
+
+def make_report(evidence: Evidence) -> Report:
+    """
+    :param evidence: rows of one experiment
+    :return: its report; where there are no rows, tables and figure say so
+    """
+    kind = evidence.experiment.report
+    shown = [name for _, name in evidence.table_rows()]
+    caption = evidence.caption(shown) if kind in ("figure", "bounds") else ""
+    found: dict[str, TextTable] = {}
+    judged = verdicts(evidence)
+    if kind == "table":
+        found["scores"] = tables.score_table(evidence)
+        found |= {f"aggregates-{source}": table for source, table in tables.aggregate_tables(evidence).items()}
+        found["run-times"] = tables.runtime_table(evidence)
+        found["long"] = tables.long_table(evidence)
+        judged.append(reproduction(evidence))
+    elif kind == "figure":
+        found["long"] = tables.long_table(evidence)
+    elif kind == "bounds":
+        found = {"bounds": bounds_table(), "claim-4.3": toy_table()}
+        judged = [_toy_verdict(found["claim-4.3"]), *judged]
+    elif kind == "diagnosis":
+        found = {"changes": diagnosis.variant_table(evidence), "diagnostics": diagnosis.diagnostics_table(evidence)}
+    elif kind == "configuration":
+        found = {"rows": config_table(), "common": common_table()}
+        judged = [_config_verdict(found["rows"])]
+    return Report(found, bool(evidence.experiment.panels), caption, judged)
+
+
+def reproduction(evidence: Evidence) -> Verdict:
+    """
+    :param evidence: of a table
+    :return: on how many of DCE's rows our interval meets the paper's mean and deviation; D4RL's files only
+    """
+    hits: list[str] = []
+    misses: list[str] = []
+    dce = evidence.experiment.variant("DCE")
+    for dataset, name in evidence.table_rows():
+        cell, scores = paper_score(dataset.paper, "DCE"), evidence.last(dce, name)
+        if source_of(name) != "D4RL" or cell is None or cell.score is None or len(scores) < 2:
+            continue
+        low, high = bootstrap_interval([scores])
+        spread = cell.std or 0.0
+        met = low <= cell.score + spread and high >= cell.score - spread
+        (hits if met else misses).append(f"{name} ({scores.mean():.1f}, paper {cell.score:g})")
+    n = len(hits) + len(misses)
+    numbers = f"{len(hits)} of {n} rows; missed: {', '.join(misses) or 'none'}" if n else "no runs on D4RL's own files"
+    rule = "the 95 % interval over our seeds overlaps the paper's mean ± its deviation, on every row of D4RL's data"
+    return judge("DCE's scores are reproduced", rule, None if not n else not misses, numbers)
+
+
+# -- appendix ------------------------------------------------------------------------------------------------------
+
+
+def bounds_table() -> TextTable:
+    """
+    :return: bounds of Eq. 14, 16 and 17 for the betas of the figures
+    """
+    sampling = sampling_bound(1.0, 1.0, 1.0, 0.7, 0.99, 100)
+    rows = []
+    for beta in (1.0, 2.0, 4.0, 8.0):
+        penalty = penalty_bound(beta, 0.99)
+        rows.append((f"{beta:g}", *(f"{value:.2f}" for value in (penalty, sampling, upper_bound(0.0, penalty, sampling)))))
+    header = ("beta, theory units", "penalty, Eq. 14", "sampling, Eq. 16", "sum, Eq. 17")
+    caption = (
+        "Formulas alone: gamma 0.99, n infinite, density ratio 1, C_r = C_T = R_max = 1, expectile 0.7, 100 visits. Theory "
+        "units are beta_eff = beta / (2 td_loss_coef). Eq. 17 is printed as an upper bound; it bounds the absolute error."
+    )
+    return TextTable(header, tuple(rows), caption)
+
+
+def toy_table() -> TextTable:
+    """
+    Claim 4.3 on a linear critic with features (1, a), data at a = -1 and 1, values k a, and a policy at x outside.
+
+    :return: solved critics and which action they prefer
+    """
+    rows = []
+    for k, beta, x in ((1.2, 0.5, 2.0), (0.8, 0.5, 2.0), (2.0, 0.5, 3.0), (1.2, 0.5, 3.0)):
+        data = np.array([[1.0, -1.0], [1.0, 1.0]])
+        second_moment, target = data.T @ data / 2, data.T @ (k * data[:, 1]) / 2
+        w = np.linalg.solve(second_moment, target - beta * np.array([1.0, x]))
+        q_data, q_ood = float(w @ [1.0, 1.0]), float(w @ [1.0, x])
+        gain, shift = k * (x - 1), beta * (1 + x * x) - beta * (1 + x)
+        cells = (f"{k:g}", f"{beta:g}", f"{x:g}", f"{q_data:.2f}", f"{q_ood:.2f}", f"{gain:.2f}", f"{shift:.2f}")
+        rows.append((*cells, "yes" if q_ood > q_data else "no", "yes" if gain > shift else "no"))
+    header = ("k", "beta_eff", "x", "Q(1)", "Q(x)", "gain of Q*", "difference of the shifts", "x preferred", "claim says")
+    return TextTable(header, tuple(rows), "Closed solution of the linear critic, no training (dce.md, claim 4.3).")
+
+
+def _toy_verdict(table: TextTable) -> Verdict:
+    agreeing = sum(row[-1] == row[-2] for row in table.rows)
+    claim = "Claim 4.3: an action outside of the data is preferred exactly if its gain exceeds the difference of the shifts"
+    rule = "holds in every row of the linear example"
+    return judge(claim, rule, agreeing == len(table.rows), f"{agreeing} of {len(table.rows)} rows")
+
+
+# -- configuration -------------------------------------------------------------------------------------------------
+
+
+def config_table() -> TextTable:
+    """
+    :return: the 23 rows as printed, as in our file, and whether the schedules agree
+    """
+    schedules = {row.pop("dataset"): row for row in read_csv("beta_schedules.csv")}
+    rows = []
+    for printed in read_csv("paper_config.csv"):
+        name = printed["dataset"]
+        ours = hyperparams.split_row(hyperparams.load_row("dce", name)).kwargs
+        beta, final, rate = ours["beta"], ours["beta_final"], ours["beta_rate"]
+        every = ours["beta_update_every"] * ours["steps_per_epoch"]
+        schedule = StepSchedule(beta, final, rate, every)
+        same = all(
+            abs(schedule.value(int(epoch) * ours["steps_per_epoch"]) - float(value)) < 1e-6
+            for epoch, value in schedules[name].items()
+        )
+        alpha = str(ours["ent_coef"]) if isinstance(ours["ent_coef"], str) else f"{ours['ent_coef']:g}"
+        end = beta if final is None else final
+        cells = (printed["ent_coef"], printed["beta_start"], printed["beta_end"], printed["beta_rate"])
+        in_file = (alpha, f"{beta:g}", f"{end:g}", f"{rate:g}")
+        rows.append((name, *cells, *in_file, "yes" if same and cells[0] == alpha else "no"))
+    names = ("alpha", "beta, start", "beta, end", "rate")
+    header = ("data", *(f"paper: {n}" for n in names), *(f"file: {n}" for n in names), "alpha and schedule agree")
+    note = "Schedules are compared at every 50th epoch. relocate-cloned: printed '0.1' with rate 0.5, read as a constant."
+    return TextTable(header, tuple(rows), note)
+
+
+def common_table() -> TextTable:
+    """
+    :return: the common configuration as printed and as in our file
+    """
+    ours = hyperparams.split_row(hyperparams.load_row("dce", "halfcheetah-medium-v2")).kwargs
+    cells = [(text, printed, str(ours[name]), f"`{name}`") for text, printed, name in COMMON]
+    note = (
+        f"`zoo_hyperparams/{OfflineDCE.algo_name}.yml`. Batch size and hidden layers of the ancestors where none is printed."
+    )
+    return TextTable(("what", "paper", "file", "parameter"), tuple(cells), note)
+
+
+def _config_verdict(table: TextTable) -> Verdict:
+    agreeing = sum(row[-1] == "yes" for row in table.rows)
+    rule = "alpha and the whole schedule of beta agree in all 23 rows"
+    return judge("E21: the configurations are the paper's", rule, agreeing == 23, f"{agreeing} of {len(table.rows)} rows")
+
+
+def count(judged: list[Verdict]) -> str:
+    """
+    :param judged: verdicts
+    :return: how many held, did not hold, could not be tested
+    """
+    held, untested = (sum(v.outcome == outcome for v in judged) for outcome in (HELD, UNTESTED))
+    return f"{held} held, {len(judged) - held - untested} did not hold, {untested} could not be tested"

@@ -1,0 +1,240 @@
+"""What ``sb3-dce reproduce`` does: train what is missing, turn it into rows, make tables, figures and a page from them."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pandas as pd
+from rich.console import Console
+from rich.table import Table
+
+from sb3_dce.errors import ConfigError
+from sb3_dce.experiments import results
+from sb3_dce.experiments.evidence import Evidence
+from sb3_dce.experiments.figures import draw
+from sb3_dce.experiments.grid import (
+    SCALES,
+    Experiment,
+    PlannedRun,
+    Scale,
+    expand,
+    experiment_ids,
+    load_experiment,
+    present_datasets,
+)
+from sb3_dce.experiments.pages import write_page
+from sb3_dce.experiments.reports import Report, count, make_report
+from sb3_dce.experiments.run import execute, is_complete
+from sb3_dce.hyperparams import did_you_mean
+
+ALL = "all"
+PRESENT = "present"
+
+
+@dataclass(frozen=True)
+class Request:
+    """
+    One call of the command.
+
+    :param ids: experiments, in order
+    :param scale: "smoke", "cpu" or "full"
+    :param out: folder of runs, rows, tables and figures
+    :param datasets: only these, "present" for those whose files are here; empty for all
+    :param seeds: number of seeds instead of the scale's
+    :param updates: gradient steps instead of the scale's
+    :param workers: processes on a CPU
+    :param device: "auto", "cpu" or "cuda"
+    :param ray_address: of a cluster
+    :param reuse: folders of rows; the runs in them count as done
+    :param imports: folders of runs made by other commands, taken over as rows
+    :param report_only: train nothing
+    :param page: results page to write
+    """
+
+    ids: tuple[str, ...]
+    scale: str
+    out: Path
+    datasets: tuple[str, ...] = ()
+    seeds: int | None = None
+    updates: int | None = None
+    workers: int = 1
+    device: str = "auto"
+    ray_address: str | None = None
+    reuse: tuple[Path, ...] = ()
+    imports: tuple[Path, ...] = ()
+    report_only: bool = False
+    page: Path | None = None
+
+
+def parse_ids(text: str) -> tuple[str, ...]:
+    """
+    :param text: an experiment, several separated by commas, or "all"
+    :return: names
+    :raises ConfigError: for an unknown one
+    """
+    names = tuple(name.strip() for name in text.split(",") if name.strip())
+    return tuple(experiment_ids()) if names == (ALL,) else tuple(load_experiment(name).id for name in names)
+
+
+def reproduce(request: Request, console: Console) -> dict[str, Report]:
+    """
+    Train what is missing and report. The same call goes on after an interruption; nothing is trained or counted twice.
+
+    :param request: what is wanted
+    :param console: where to print
+    :return: reports by experiment
+    :raises SB3DCEError: if data are missing, or a run fails for another reason than divergence
+    """
+    if request.scale not in SCALES:
+        hint = f"{did_you_mean(request.scale, SCALES)}There are {', '.join(SCALES)}."
+        raise ConfigError(f"no scale {request.scale!r}", key="--scale", hint=hint)
+    experiments = [load_experiment(name) for name in request.ids]
+    scales = {e.id: _scale(e, request) for e in experiments}
+    for folder in (*request.reuse, *request.imports):
+        if not folder.is_dir():
+            raise ConfigError("no such folder", where=str(folder), key="--reuse/--import", hint="Check the path.")
+    known = results.merge([results.read_folder(request.out / "rows"), *map(results.read_folder, request.reuse)])
+    if request.report_only:
+        rows = results.merge(
+            [known, *(results.import_runs(f, request.ids[0]) for f in (request.out / "runs", *request.imports))]
+        )
+    else:
+        planned = [run for e in experiments for run in _plan(e, scales[e.id], request)]
+        imported = results.merge(results.import_runs(folder, request.ids[0]) for folder in request.imports)
+        known = results.merge([known, imported])
+        _say_plan(planned, known, scales, console)
+        diverged = execute(planned, results.done_keys(known), request.workers, request.device, request.ray_address, console)
+        for text in diverged:
+            console.print(f"diverged: {text}", markup=False)
+        rows = results.merge([known, results.planned_rows(planned)])
+        _keep_rows(rows, experiments, request)
+    evidences, reports = {}, {}
+    for experiment in experiments:
+        length = request.updates if request.report_only else scales[experiment.id].updates
+        evidence = Evidence(experiment, rows, scales[experiment.id], length)
+        evidences[experiment.id], reports[experiment.id] = evidence, _report(evidence, request.out, console)
+    if request.page is not None:
+        write_page(request.page, request.out, evidences, reports, _command(request))
+        console.print(f"page   {request.page}", markup=False)
+    return reports
+
+
+def show_list(console: Console) -> None:
+    """
+    :param console: where the experiments are listed, with their runs at each scale and the data that are here
+    """
+    view = Table(box=None, header_style="bold")
+    for title in ("id", "items", "what", "runs: smoke", "cpu", "full", "data here"):
+        view.add_column(title, justify="right" if title in ("runs: smoke", "cpu", "full") else "left")
+    for name in experiment_ids():
+        experiment = load_experiment(name)
+        n = {scale: _count(experiment, experiment.scales[scale]) for scale in SCALES}
+        here = present_datasets(experiment, experiment.scales["full"])
+        data = f"{len(here)} of {len(experiment.datasets)}" if experiment.datasets else "none needed"
+        view.add_row(name, ", ".join(experiment.items), experiment.title, *(f"{n[s]}" for s in SCALES), data)
+    console.print(view)
+
+
+def _count(experiment: Experiment, scale: Scale) -> int:
+    """Runs of a whole grid, whether its data are here or not; two variants may be one run."""
+    if scale.source == "embedded":
+        return len({run.spec.folder for run in expand(experiment, scale, Path())})
+    return scale.seeds * sum(
+        v.datasets is None or dataset.paper in v.datasets for dataset in experiment.datasets for v in experiment.variants
+    )
+
+
+def _scale(experiment: Experiment, request: Request) -> Scale:
+    scale = experiment.scales[request.scale]
+    if request.updates is not None:
+        every = min(scale.eval_freq, request.updates)
+        if request.updates % every:
+            raise ConfigError(
+                f"{request.updates} gradient steps do not end with an evaluation, which there is every {every}",
+                key="--updates",
+                hint=f"Take a multiple of {every}.",
+            )
+        scale = replace(scale, updates=request.updates, eval_freq=every)
+    return scale if request.seeds is None else replace(scale, seeds=request.seeds)
+
+
+def _plan(experiment: Experiment, scale: Scale, request: Request) -> list[PlannedRun]:
+    if not experiment.datasets:
+        return []
+    names: Sequence[str] | None = request.datasets or None
+    if names == (PRESENT,):
+        names = present_datasets(experiment, scale)
+    return expand(experiment, scale, request.out / "runs", names)
+
+
+def _say_plan(planned: list[PlannedRun], known: pd.DataFrame, scales: dict[str, Scale], console: Console) -> None:
+    runs = {run.spec.folder: run for run in planned}
+    done = results.done_keys(known)
+    complete = sum(run.key in done or is_complete(run.spec) for run in runs.values())
+    data = ", ".join(dict.fromkeys(run.spec.dataset for run in runs.values()))
+    if runs:
+        lengths = ", ".join(dict.fromkeys(f"{run.spec.n_updates:,}" for run in runs.values()))
+        console.print(f"{len(runs)} runs of {lengths} gradient steps, {complete} of them complete; data: {data}", markup=False)
+    small = next((scale for scale in scales.values() if scale.set), None)
+    if small is not None and runs:
+        console.print(
+            f"smoke scale: tiny data, {small.updates} updates, settings {small.set} {small.set_for}: a test of the machinery; "
+            "the numbers say nothing about the agents",
+            markup=False,
+        )
+
+
+def _keep_rows(rows: pd.DataFrame, experiments: list[Experiment], request: Request) -> None:
+    """One file per experiment; what a reused folder holds is not copied."""
+    reused = results.merge(map(results.read_folder, request.reuse))
+    own = results.without(rows, reused)
+    for name in dict.fromkeys([*(e.id for e in experiments), *own["experiment"].unique()]):
+        part = own[own["experiment"] == name]
+        if len(part):
+            results.write_rows(request.out / "rows" / f"{name}.csv.gz", part)
+
+
+def _report(evidence: Evidence, out: Path, console: Console) -> Report:
+    experiment = evidence.experiment
+    report = make_report(evidence)
+    console.print(f"\n[b]{experiment.title}[/b] ({', '.join(experiment.items)})")
+    written = []
+    for name, table in report.tables.items():
+        written += table.write(out / "tables", f"{experiment.id}-{name}")
+        if name != "long":
+            _show(name, table.header, table.rows, console)
+    if report.has_figure:
+        written += draw(evidence, out / "figures", experiment.id)
+        console.print(report.caption, markup=False)
+    for verdict in report.verdicts:
+        console.print(f"  {verdict.outcome:<20} {verdict.claim}   [{verdict.numbers}]", markup=False)
+    if report.verdicts:
+        console.print(f"  {count(report.verdicts)}")
+    if evidence.left_out:
+        console.print(f"  left out: {evidence.left_out} runs on another version of a file")
+    folders = ", ".join(dict.fromkeys(f"{path.parent}/{experiment.id}*" for path in written))
+    console.print(f"saved  {folders}", markup=False)
+    return report
+
+
+def _show(name: str, header: tuple[str, ...], rows: tuple[tuple[str, ...], ...], console: Console) -> None:
+    """Of a wide table the terminal gets our own columns and the paper's DCE; the files have all."""
+    shown = [
+        i for i, title in enumerate(header) if not title.startswith("paper: ") or title == "paper: DCE" or len(header) < 10
+    ]
+    view = Table(title=name, box=None, header_style="bold", title_justify="left")
+    for i in shown:
+        view.add_column(header[i].removeprefix("ours: "), justify="left" if i == 0 else "right")
+    for row in rows:
+        view.add_row(*(row[i].replace("**", "") for i in shown))
+    console.print(view)
+
+
+def _command(request: Request) -> str:
+    if Path(sys.argv[0]).name == "sb3-dce":
+        return shlex.join(["sb3-dce", *sys.argv[1:]])
+    return f"sb3-dce reproduce {','.join(request.ids)} --report-only --out {request.out}"

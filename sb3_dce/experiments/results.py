@@ -1,0 +1,305 @@
+"""
+Result rows: the one format between runs and tables.
+
+A row is one number of one run at one step. Rows are kept in ``*.csv.gz`` files, small enough for a repository; models are
+not needed to make a table again. A run is known by data, agent, configuration, length and seed: found twice, in a folder
+and in a file or in two files, it counts once.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from sb3_dce.data.catalog import resolve
+from sb3_dce.data.locate import short_name
+from sb3_dce.errors import CheckpointError, SB3DCEError
+from sb3_dce.evaluation import catalogue_id, read_evaluations
+from sb3_dce.experiments.grid import PlannedRun, config_hash, differences
+from sb3_dce.files import write_atomically
+from sb3_dce.runs import read_config, read_divergence, read_result
+
+COLUMNS = (
+    "experiment",
+    "dataset",
+    "dataset_sha256",
+    "agent",
+    "hyperparameters",
+    "config_hash",
+    "n_updates",
+    "seed",
+    "step",
+    "metric",
+    "value",
+    "code_version",
+    "device",
+)
+# What makes a run the same run.
+RUN_KEY = ["dataset", "dataset_sha256", "agent", "config_hash", "n_updates", "seed"]
+PLAN_KEY = ["dataset", "agent", "config_hash", "n_updates", "seed"]
+# Diagnostics that figures, verdicts and the search for causes read, by their names in the log.
+CURVES = ("q_data", "q_policy", "value", "gap_td", "ent_coef", "beta_eff", "survival_margin", "action_dist", "entropy", "adv")
+PROBE_CURVE = re.compile(r"probe\d+_(data|policy|init|best|max|min)")
+# A curve of diagnostics has at most this many points, each the mean since the last.
+POINTS = 100
+# Episodes of the paper's evaluation: four in its Gym table, five in the text for the others.
+PAPER_EPISODES = {"gym": 4, "adroit": 5, "kitchen": 5}
+
+
+class ResultsError(SB3DCEError, ValueError):
+    """Result rows are damaged or contradict each other."""
+
+
+def rows_of_run(folder: Path, experiment: str) -> pd.DataFrame | None:
+    """
+    :param folder: of one run, as :func:`sb3_dce.runs.run` writes it
+    :param experiment: id of the experiment it is run for
+    :return: its rows; ``None`` unless it is complete or has diverged
+    :raises CheckpointError: if a file is damaged
+    """
+    config, result, divergence = read_config(folder), read_result(folder), read_divergence(folder)
+    if config is None or (result is None and divergence is None):
+        return None
+    try:
+        run, data = config["run"], config["dataset"]
+        dataset_id = catalogue_id(data["name"])
+        n_updates = int(run["n_updates"] if result is None else result["n_updates"])
+        commit = config["versions"].get("commit")
+        common = {
+            "experiment": experiment,
+            "dataset": dataset_id or short_name(data["name"]),
+            "dataset_sha256": data["sha256"],
+            "agent": run["algo"],
+            "hyperparameters": differences(run["algo"], dataset_id, run["overrides"]),
+            "config_hash": config_hash(run["algo"], config["hyperparameters"]),
+            "n_updates": n_updates,
+            "seed": int(run["seed"]),
+            "code_version": config["versions"]["sb3_dce"] + (f"+{commit}" if commit else ""),
+            "device": str(config["machine"]["device"]),
+        }
+        values = [*_facts(folder, config, result, divergence, n_updates), *_curves(folder, n_updates, run["eval_freq"])]
+        values += _evaluations(folder, dataset_id, n_updates)
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            f"the folder is not that of a run of this package: {error!r}",
+            where=str(folder),
+            path=folder,
+            hint="Name folders that sb3-dce train, compare or reproduce wrote.",
+        ) from error
+    finite = [(step, metric, float(f"{value:.6g}")) for step, metric, value in values if np.isfinite(value)]
+    return _ordered(pd.DataFrame([{**common, "step": s, "metric": m, "value": v} for s, m, v in finite]))
+
+
+def import_runs(folder: Path, experiment: str) -> pd.DataFrame:
+    """
+    :param folder: anywhere above folders of runs
+    :param experiment: id of the experiment they are taken for
+    :return: rows of all complete runs below
+    """
+    found = [rows_of_run(path.parent, experiment) for path in sorted(folder.rglob("config.yml"))]
+    return merge(rows for rows in found if rows is not None)
+
+
+def planned_rows(planned: Iterable[PlannedRun]) -> pd.DataFrame:
+    """
+    :param planned: runs of a grid
+    :return: rows of those that are complete, each run once
+    """
+    by_folder = {run.spec.folder: run.experiment for run in planned}
+    found = [rows_of_run(Path(folder), experiment) for folder, experiment in by_folder.items()]
+    return merge(rows for rows in found if rows is not None)
+
+
+def merge(parts: Iterable[pd.DataFrame]) -> pd.DataFrame:
+    """
+    :param parts: rows; where two hold the same run, the first counts
+    :return: all rows, each run once
+    """
+    kept: list[pd.DataFrame] = []
+    known: set[tuple[Any, ...]] = set()
+    for part in parts:
+        keys = pd.Series(list(part[RUN_KEY].itertuples(index=False, name=None)), index=part.index, dtype=object)
+        kept.append(part[~keys.isin(known)])
+        known |= set(keys)
+    filled = [part for part in kept if len(part)]
+    return _ordered(pd.concat(filled, ignore_index=True)) if filled else empty()
+
+
+def without(rows: pd.DataFrame, others: pd.DataFrame) -> pd.DataFrame:
+    """
+    :param rows: rows
+    :param others: rows
+    :return: the rows of runs that ``others`` does not hold
+    """
+    known = set(others[RUN_KEY].itertuples(index=False, name=None))
+    return rows[[key not in known for key in rows[RUN_KEY].itertuples(index=False, name=None)]]
+
+
+def done_keys(rows: pd.DataFrame) -> set[tuple[Any, ...]]:
+    """
+    :param rows: rows
+    :return: dataset, agent, configuration, length and seed of every run in them
+    """
+    return set(rows[PLAN_KEY].itertuples(index=False, name=None))
+
+
+def empty() -> pd.DataFrame:
+    """
+    :return: no rows
+    """
+    return _ordered(pd.DataFrame(columns=list(COLUMNS)))
+
+
+def write_rows(path: Path, rows: pd.DataFrame) -> None:
+    """
+    :param path: ``.csv.gz`` file; the same rows give the same bytes
+    :param rows: rows
+    :raises ResultsError: if they are not what rows have to be
+    """
+    check_rows(rows, str(path))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    ordered = rows.sort_values([*PLAN_KEY, "metric", "step"], kind="stable")
+    with write_atomically(path) as stream:
+        ordered.to_csv(stream, index=False, compression={"method": "gzip", "mtime": 0}, quoting=csv.QUOTE_MINIMAL)
+
+
+def read_rows(path: Path) -> pd.DataFrame:
+    """
+    :param path: file that :func:`write_rows` wrote
+    :return: rows
+    :raises ResultsError: if it is damaged or something else
+    """
+    text = {name: str for name in COLUMNS if name not in ("n_updates", "seed", "step", "value")}
+    try:
+        rows = pd.read_csv(path, dtype=text, compression="gzip", keep_default_na=False, na_values={"value": [""]})
+    except (OSError, EOFError, ValueError) as error:
+        raise ResultsError(
+            f"the file cannot be read: {error}", where=str(path), hint="Take it from the repository."
+        ) from error
+    check_rows(rows, str(path))
+    return _ordered(rows)
+
+
+def read_folder(folder: Path) -> pd.DataFrame:
+    """
+    :param folder: with ``.csv.gz`` files; need not exist
+    :return: all their rows, each run once
+    """
+    return merge(read_rows(path) for path in sorted(folder.glob("*.csv.gz")))
+
+
+def check_rows(rows: pd.DataFrame, where: str) -> None:
+    """
+    :param rows: rows
+    :param where: for the message
+    :raises ResultsError: for missing columns, numbers that are none, a step twice, or a run with two configurations
+    """
+
+    def refuse(what: str) -> None:
+        raise ResultsError(what, where=where, hint="Make the file again from the run folders.")
+
+    if tuple(rows.columns) != COLUMNS:
+        refuse(f"columns are {', '.join(map(str, rows.columns))}; they must be {', '.join(COLUMNS)}")
+    if rows.empty:
+        return
+    for name in ("n_updates", "seed", "step"):
+        if not pd.api.types.is_integer_dtype(rows[name]) or (rows[name] < 0).any():
+            refuse(f"{name} must be whole numbers from 0 up")
+    if not np.isfinite(rows["value"].to_numpy(dtype=float)).all():
+        refuse("value must be finite numbers")
+    if not rows["dataset_sha256"].str.fullmatch(r"[0-9a-f]{64}").all():
+        refuse("dataset_sha256 must be 64 hexadecimal digits")
+    if (twice := rows.duplicated([*RUN_KEY, "step", "metric"])).any():
+        first = rows[twice].iloc[0]
+        refuse(f"{first['metric']} at step {first['step']} of {first['agent']} on {first['dataset']} is there twice")
+    for text in rows["hyperparameters"].unique():
+        try:
+            valid = isinstance(json.loads(text), dict)
+        except ValueError:
+            valid = False
+        if not valid:
+            refuse(f"hyperparameters must be a JSON object, got {text[:60]!r}")
+    if (rows.groupby(RUN_KEY)[["hyperparameters", "code_version"]].nunique() > 1).to_numpy().any():
+        refuse("one run has two sets of hyperparameters or two code versions")
+
+
+def _facts(
+    folder: Path, config: dict[str, Any], result: dict[str, Any] | None, divergence: dict[str, Any] | None, n_updates: int
+) -> list[tuple[int, str, float]]:
+    """Numbers of the whole run, at its last step; of its data, at step 0."""
+    data = config["dataset"]
+    facts = [(0, f"data_{name}", float(data[name])) for name in ("rows", "reward_mean", "n_terminals") if name in data]
+    if result is not None:
+        facts.append((n_updates, "seconds", float(result["seconds"])))
+    else:
+        assert divergence is not None
+        facts.append((int(divergence["n_updates"]), "diverged", 1.0))
+    return facts
+
+
+def _evaluations(folder: Path, dataset_id: str | None, n_updates: int) -> list[tuple[int, str, float]]:
+    values: list[tuple[int, str, float]] = []
+    evaluations = [e for e in read_evaluations(folder, dataset_id) if e.n_updates <= n_updates]
+    for e in evaluations:
+        values.append((e.n_updates, "return", e.mean))
+        if e.score is not None:
+            values.append((e.n_updates, "score", e.score))
+    if evaluations and evaluations[-1].n_updates == n_updates:
+        last = evaluations[-1]
+        values += [(n_updates, "n_episodes", len(last.returns)), (n_updates, "mean_length", float(np.mean(last.lengths)))]
+        family = None if dataset_id is None else resolve(dataset_id).family
+        n_paper = PAPER_EPISODES.get(family or "")
+        if n_paper is not None and last.score is not None and len(last.returns) >= n_paper:
+            # the first episodes, which were fixed before anything was known about them
+            first = type(last)(last.n_updates, last.returns[:n_paper], last.lengths[:n_paper], dataset_id)
+            assert first.score is not None
+            values.append((n_updates, "score_paper_episodes", first.score))
+    return values
+
+
+def _curves(folder: Path, n_updates: int, eval_freq: int) -> list[tuple[int, str, float]]:
+    """Diagnostics of the log, averaged over intervals of at least ``eval_freq`` steps."""
+    log = read_log(folder)
+    if log.empty:
+        return []
+    width = max(eval_freq, -(-n_updates // POINTS))
+    columns = [str(name).removeprefix("train/") for name in log if str(name).startswith("train/")]
+    names = [name for name in columns if name in CURVES or PROBE_CURVE.fullmatch(name)]
+    ends = (-(-log.index.to_numpy(dtype=int) // width) * width).clip(max=n_updates)
+    means = log[[f"train/{name}" for name in names]].groupby(ends).mean()
+    steps = [int(step) for step in means.index.to_numpy(dtype=int)]
+    return [(s, name, float(v)) for name in names for s, v in zip(steps, means[f"train/{name}"].to_numpy(), strict=True)]
+
+
+def read_log(folder: Path) -> pd.DataFrame:
+    """
+    :param folder: of a run
+    :return: its log by gradient steps; where it was killed and went on from a checkpoint, what the resumed run wrote counts
+    """
+    starts = {path: int(path.stem.partition("_")[2]) for path in folder.glob("progress_*.csv") if path.stat().st_size}
+    parts: list[pd.DataFrame] = []
+    for path in sorted(starts, key=starts.__getitem__):
+        part = pd.read_csv(path, on_bad_lines="skip")  # the last line may have been cut by a kill
+        if "time/total_timesteps" not in part:
+            continue
+        part = part.dropna(subset=["time/total_timesteps"]).groupby("time/total_timesteps").first()
+        parts = [earlier[earlier.index <= starts[path]] for earlier in parts]
+        parts.append(part[part.index > starts[path]])
+    parts = [part for part in parts if len(part)]
+    if not parts:
+        return pd.DataFrame()
+    log = pd.concat(parts).sort_index()
+    log.index = log.index.astype(int)
+    return log
+
+
+def _ordered(rows: pd.DataFrame) -> pd.DataFrame:
+    whole = {"n_updates": "int64", "seed": "int64", "step": "int64", "value": "float64"}
+    return rows[list(COLUMNS)].reset_index(drop=True).astype(whole)

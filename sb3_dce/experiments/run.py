@@ -1,0 +1,117 @@
+"""Carrying out the runs of a grid: processes on a CPU, populations on a GPU, or the nodes of a Ray cluster."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch as th
+from rich.console import Console
+from stable_baselines3.common.utils import get_device
+
+from sb3_dce import hyperparams
+from sb3_dce.agents import agent_class
+from sb3_dce.data.catalog import resolve
+from sb3_dce.errors import DivergenceError
+from sb3_dce.experiments.grid import PlannedRun
+from sb3_dce.experiments.probe import prepare_probe
+from sb3_dce.launch import launch_all
+from sb3_dce.population import SCALARS
+from sb3_dce.population_runs import train_population
+from sb3_dce.runs import RunSpec, read_divergence, read_result
+
+# More members than this are trained one population after the other.
+MAX_MEMBERS = 64
+
+
+def execute(
+    planned: Sequence[PlannedRun],
+    done: set[tuple[Any, ...]],
+    workers: int,
+    device: th.device | str,
+    ray_address: str | None,
+    console: Console,
+) -> list[str]:
+    """
+    Train what is not complete, each run once, those first that others need.
+
+    :param planned: runs of grids
+    :param done: keys of runs whose rows are known; they are not trained
+    :param workers: processes on a CPU
+    :param device: "cpu", "cuda" or "auto"; on "cuda" runs that differ in data, seed or numbers are one batched computation
+    :param ray_address: of a Ray cluster that trains instead of this machine
+    :param console: where progress is shown
+    :return: for each run that diverged, what happened
+    :raises SB3DCEError: the first other error, after all others have been run
+    """
+    wanted = {run.spec.folder: run for run in planned if run.key not in done and not is_complete(run.spec)}
+    needed = {run.needs for run in wanted.values() if run.needs is not None}
+    # rows may be known without a model: the probe needs that
+    wanted.update({run.spec.folder: run for run in planned if run.spec.folder in needed and not is_complete(run.spec)})
+    first = [run.spec for run in wanted.values() if run.needs is None]
+    after = [(run.spec, Path(run.needs)) for run in wanted.values() if run.needs is not None]
+    device = get_device(device)
+    failures = _run_all(first, workers, device, ray_address, console)
+    for spec, best_policy in after:
+        prepare_probe(spec, best_policy)
+    # A probe begins from a file on this machine, and is one model with five sets of critics: never batched.
+    failures += _run_all([spec for spec, _ in after], workers, th.device("cpu"), None, console)
+    other = [error for error in failures if not isinstance(error, DivergenceError)]
+    if other:
+        raise other[0]
+    return [str(error) for error in failures]
+
+
+def is_complete(spec: RunSpec) -> bool:
+    """
+    :param spec: of a run
+    :return: whether its folder holds all of it; a run that has diverged is complete
+    """
+    folder = Path(spec.folder)
+    result = read_result(folder)
+    return read_divergence(folder) is not None or (result is not None and result["n_updates"] == spec.n_updates)
+
+
+def _run_all(
+    specs: list[RunSpec], workers: int, device: th.device, ray_address: str | None, console: Console
+) -> list[BaseException]:
+    if not specs:
+        return []
+    if ray_address is not None:
+        from sb3_dce.experiments.cluster import run_on_cluster
+
+        return run_on_cluster(specs, ray_address, console)
+    if device.type == "cpu":
+        return [outcome for outcome in launch_all(specs, workers, console) if isinstance(outcome, BaseException)]
+    failures: list[BaseException] = []
+    for group in populations(specs):
+        try:
+            _train_group(group, device, console)
+        except Exception as error:
+            failures.append(error)
+    return failures
+
+
+def populations(specs: Iterable[RunSpec]) -> list[list[RunSpec]]:
+    """
+    :param specs: runs
+    :return: groups that can be trained as one population each
+    """
+    groups: dict[Any, list[RunSpec]] = {}
+    for spec in specs:
+        cls, data = agent_class(spec.algo), resolve(spec.dataset)
+        free = SCALARS.union(*(getattr(base, "population_scalars", ()) for base in cls.__mro__))
+        row = hyperparams.split_row(hyperparams.load_row(spec.algo, data.id)).kwargs
+        fixed = {k: v for k, v in {**row, **spec.overrides}.items() if k not in free}
+        shape = (data.obs_dim, data.act_dim)
+        key = (spec.algo, shape, repr(sorted(fixed.items())), spec.n_updates, spec.eval_freq, spec.n_eval_episodes)
+        groups.setdefault(key, []).append(spec)
+    return [group[i : i + MAX_MEMBERS] for group in groups.values() for i in range(0, len(group), MAX_MEMBERS)]
+
+
+def _train_group(group: list[RunSpec], device: th.device, console: Console) -> None:
+    names = sorted(Path(spec.folder).name for spec in group)
+    state_file = f"population-{hashlib.sha256(' '.join(names).encode()).hexdigest()[:12]}.pt"
+    train_population(group, device=device, console=console, state_file=state_file)

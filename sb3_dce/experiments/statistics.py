@@ -1,0 +1,147 @@
+"""
+Statistics of result tables, as functions of plain arrays.
+
+Scores come as one array per task (dataset), each with one number per seed; tasks may have different numbers of seeds.
+Interquartile mean, stratified bootstrap, probability of improvement and performance profile follow Agarwal et al. (2021),
+"Deep Reinforcement Learning at the Edge of the Statistical Precipice".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+Scores = Sequence[np.ndarray]
+
+N_RESAMPLES = 2000
+BOOTSTRAP_SEED = 0
+
+
+class Interval(NamedTuple):
+    """Bounds of a 95 % confidence interval, in the units of the scores."""
+
+    low: float
+    high: float
+
+    def overlaps(self, other: Interval) -> bool:
+        """
+        :param other: another interval
+        :return: whether they have a point in common
+        """
+        return self.low <= other.high and other.low <= self.high
+
+
+def sample_std(values: np.ndarray) -> float:
+    """
+    :param values: one number per seed, shape (n,)
+    :return: standard deviation with divisor n - 1; NaN for one seed
+    """
+    return float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
+
+
+def trimmed_mean(values: np.ndarray) -> np.ndarray:
+    """
+    Mean of the middle half along the last axis. Where a quarter of the number is not whole, the scores at the edges count
+    with the rest of their weight, so that exactly half of the weight is used.
+
+    :param values: shape (..., n)
+    :return: shape (...)
+    """
+    ordered = np.sort(values, axis=-1)
+    n = ordered.shape[-1]
+    ranks = np.arange(n)
+    # share of the interval [rank, rank + 1] that lies in [n / 4, 3 n / 4]
+    weights = np.clip(np.minimum(ranks + 1, 0.75 * n) - np.maximum(ranks, 0.25 * n), 0.0, 1.0)
+    return ordered @ weights / weights.sum()
+
+
+def iqm(scores: Scores) -> float:
+    """
+    Interquartile mean over all runs of all tasks.
+
+    :param scores: one array per task
+    :return: mean of the middle half
+    """
+    return float(trimmed_mean(np.concatenate([np.asarray(task, dtype=float) for task in scores])))
+
+
+def mean_of_tasks(scores: Scores) -> float:
+    """
+    :param scores: one array per task
+    :return: mean over tasks of the mean over seeds
+    """
+    return float(np.mean([np.mean(task) for task in scores]))
+
+
+def bootstrap_interval(
+    scores: Scores,
+    aggregate: Callable[[Scores], float] = mean_of_tasks,
+    n_resamples: int = N_RESAMPLES,
+    seed: int = BOOTSTRAP_SEED,
+) -> Interval:
+    """
+    Stratified bootstrap: seeds are drawn anew with replacement within each task, the aggregate is computed again.
+
+    :param scores: one array per task
+    :param aggregate: number of interest
+    :param n_resamples: repetitions
+    :param seed: of the draws
+    :return: percentiles 2.5 and 97.5
+    """
+    generator = np.random.default_rng(seed)
+    tasks = [np.asarray(task, dtype=float) for task in scores]
+    draws = [task[generator.integers(len(task), size=(n_resamples, len(task)))] for task in tasks]
+    values = [aggregate([draw[k] for draw in draws]) for k in range(n_resamples)]
+    low, high = np.percentile(values, [2.5, 97.5])
+    return Interval(float(low), float(high))
+
+
+def probability_of_improvement(scores: Scores, others: Scores) -> float:
+    """
+    P(X > Y): per task the share of pairs in which X is larger, ties half, then the mean over tasks.
+
+    :param scores: X, one array per task
+    :param others: Y, for the same tasks in the same order
+    :return: in [0, 1]
+    """
+    shares = []
+    for x, y in zip(scores, others, strict=True):
+        difference = np.asarray(x, dtype=float)[:, None] - np.asarray(y, dtype=float)[None, :]
+        shares.append(np.mean((difference > 0) + 0.5 * (difference == 0)))
+    return float(np.mean(shares))
+
+
+def performance_profile(scores: Scores, thresholds: np.ndarray) -> np.ndarray:
+    """
+    :param scores: one array per task
+    :param thresholds: scores, shape (n,)
+    :return: fraction of all runs above each threshold, shape (n,)
+    """
+    runs = np.concatenate([np.asarray(task, dtype=float) for task in scores])
+    return (runs[:, None] > np.asarray(thresholds, dtype=float)[None, :]).mean(axis=0)
+
+
+class Total(NamedTuple):
+    """
+    Sum over the rows of a table.
+
+    :param mean: sum of the row means
+    :param paper_std: plain sum of the row deviations, which the paper prints; no standard deviation of the total
+    :param std: root of the sum of squares, the deviation of the total if the rows are independent
+    """
+
+    mean: float
+    paper_std: float
+    std: float
+
+
+def total(means: Sequence[float], stds: Sequence[float]) -> Total:
+    """
+    :param means: of the rows
+    :param stds: sample standard deviations of the rows; NaN (one seed, or none printed) counts as 0
+    :return: sums
+    """
+    known = np.nan_to_num(np.asarray(stds, dtype=float))
+    return Total(float(np.sum(means)), float(known.sum()), float(np.sqrt(np.square(known).sum())))

@@ -1,0 +1,291 @@
+"""Tables made from rows: Markdown, LaTeX and CSV of the same cells, the paper's numbers in columns of their own."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sb3_dce.experiments.evidence import Evidence
+from sb3_dce.experiments.grid import Variant, source_of
+from sb3_dce.experiments.paper import paper_score, paper_scores
+from sb3_dce.experiments.statistics import (
+    Interval,
+    bootstrap_interval,
+    iqm,
+    mean_of_tasks,
+    probability_of_improvement,
+    sample_std,
+    total,
+)
+from sb3_dce.files import write_atomically
+
+BOLD_RULE = (
+    "Bold: the 95 % bootstrap interval over seeds overlaps that of the best mean of the row (with one seed: the best mean). "
+    "± is the sample standard deviation over seeds."
+)
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """
+    Cells as text.
+
+    :param header: headings
+    :param rows: cells; ``**text**`` is bold
+    :param caption: where the numbers come from
+    """
+
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    caption: str
+
+    def markdown(self) -> str:
+        """
+        :return: table and caption
+        """
+        lines = [self.header, tuple("---" for _ in self.header), *self.rows]
+        return "\n".join("| " + " | ".join(cells) + " |" for cells in lines) + f"\n\n{self.caption}\n"
+
+    def latex(self) -> str:
+        """
+        :return: ``table`` environment; needs the package booktabs
+        """
+        lines = [r"\begin{table}", r"\centering", r"\begin{tabular}{l" + "r" * (len(self.header) - 1) + "}", r"\toprule"]
+        body = [" & ".join(_latex(cell) for cell in cells) + r" \\" for cells in (self.header, *self.rows)]
+        lines += [body[0], r"\midrule", *body[1:], r"\bottomrule", r"\end{tabular}"]
+        return "\n".join([*lines, rf"\caption{{{_latex(self.caption)}}}", r"\end{table}", ""])
+
+    def csv(self) -> str:
+        """
+        :return: cells without marks of bold
+        """
+        text = io.StringIO(newline="")
+        csv.writer(text).writerows([self.header, *([c.replace("**", "") for c in row] for row in self.rows)])
+        return text.getvalue()
+
+    def write(self, folder: Path, name: str) -> list[Path]:
+        """
+        :param folder: of the tables
+        :param name: of the files, without ending
+        :return: files
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        written = []
+        for ending, text in (("md", self.markdown()), ("tex", self.latex()), ("csv", self.csv())):
+            path = folder / f"{name}.{ending}"
+            with write_atomically(path) as stream:
+                stream.write(text.encode())
+            written.append(path)
+        return written
+
+
+def score_table(evidence: Evidence) -> TextTable:
+    """
+    Scores of all agents on all data, and the paper's beside them.
+
+    :param evidence: of an experiment with a table
+    :return: one row per file; a dataset of the paper without results is a row "no data"
+    """
+    variants = list(evidence.experiment.variants)
+    methods = [v.paper for v in variants if v.paper is not None]
+    header = ("data", *(f"ours: {v.name}" for v in variants), "D4RL set of the paper", *(f"paper: {m}" for m in methods))
+    rows = []
+    for dataset in evidence.experiment.datasets:
+        printed = tuple(_paper_cell(dataset.paper, method) for method in methods)
+        ids = evidence.ids(dataset)
+        if not ids and evidence.scale.source != "embedded":
+            rows.append((f"{dataset.twin or dataset.paper}: no data", *("" for _ in variants), dataset.paper, *printed))
+        for name in ids:
+            best = _best_interval([evidence.last(v, name) for v in variants])
+            cells = tuple(score_cell(evidence, v, name, best) for v in variants)
+            note = f" ({dataset.note})" if dataset.note and name == dataset.twin else ""
+            rows.append((f"{name}{note}", *cells, dataset.paper, *printed))
+    ids = [name for _, name in evidence.table_rows()]
+    tuned = (
+        "DCE has the paper's row of each dataset; the paper tuned these by evaluating online. 'One setting' has its commonest "
+        "row everywhere. The paper's baselines are copied from other papers, with other protocols."
+    )
+    return TextTable(header, tuple(rows), f"{evidence.caption(ids)} {BOLD_RULE} {tuned}")
+
+
+def score_cell(evidence: Evidence, variant: Variant, dataset_id: str, best: tuple[float, Interval] | None) -> str:
+    """
+    :param evidence: rows
+    :param variant: column
+    :param dataset_id: row
+    :param best: best mean of the row and its interval
+    :return: mean, deviation, number of seeds if it is not the usual one, and how many diverged
+    """
+    scores, diverged = evidence.last(variant, dataset_id), evidence.n_diverged(variant, dataset_id)
+    lost = f" ({diverged} diverged)" if diverged else ""
+    if not len(scores):
+        return lost.strip() or "-"
+    spread = f" ± {sample_std(scores):.1f}" if len(scores) > 1 else ""
+    text = f"{scores.mean():.1f}{spread}"
+    assert best is not None
+    tied = len(scores) > 1 and bootstrap_interval([scores]).overlaps(best[1])
+    if scores.mean() == best[0] or tied:
+        text = f"**{text}**"
+    return text + lost
+
+
+def _best_interval(columns: list[np.ndarray]) -> tuple[float, Interval] | None:
+    known = [scores for scores in columns if len(scores)]
+    if not known:
+        return None
+    best = max(known, key=lambda scores: scores.mean())
+    return float(best.mean()), bootstrap_interval([best])
+
+
+def _paper_cell(dataset: str, method: str) -> str:
+    cell = paper_score(dataset, method)
+    if cell is None or cell.score is None:
+        return "-"
+    text = f"{cell.score:g}" + (f" ± {cell.std:g}" if cell.std is not None else "")
+    return f"**{text}**" if cell.bold else text
+
+
+def common_rows(evidence: Evidence, source: str) -> list[str]:
+    """
+    :param evidence: rows
+    :param source: "D4RL" or "sb3": totals are never formed over both
+    :return: data of this source on which every agent has a score
+    """
+    variants = [v for v in evidence.experiment.variants if v.datasets is None]
+    return [
+        name
+        for _, name in evidence.table_rows()
+        if source_of(name) == source and all(len(evidence.last(v, name)) for v in variants if _has_any(evidence, v))
+    ]
+
+
+def _has_any(evidence: Evidence, variant: Variant) -> bool:
+    return any(len(evidence.last(variant, name)) for _, name in evidence.table_rows())
+
+
+def aggregate_tables(evidence: Evidence) -> dict[str, TextTable]:
+    """
+    :param evidence: of an experiment with a table
+    :return: by source ("D4RL", "sb3") totals, interquartile means and probabilities of improvement
+    """
+    tables = {}
+    for source in ("D4RL", "sb3"):
+        ids = common_rows(evidence, source)
+        if ids:
+            tables[source] = _aggregate_table(evidence, ids)
+    return tables
+
+
+def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
+    variants = [v for v in evidence.experiment.variants if v.datasets is None and _has_any(evidence, v)]
+    dce = next((v for v in variants if v.name == "DCE"), None)
+    paper_rows = [dataset.paper for dataset, name in evidence.table_rows() if name in ids]
+    header = (
+        *("agent", "total", "paper's style of ± (sum of stds)", "std of the total"),
+        *("mean", "IQM", "95 % interval of the IQM", "P(DCE > agent)", "runs", "paper: total of these rows"),
+    )
+    rows = []
+    for variant in variants:
+        scores = [evidence.last(variant, name) for name in ids]
+        sums = total([task.mean() for task in scores], [sample_std(task) for task in scores])
+        low, high = bootstrap_interval(scores, iqm)
+        chance = "-"
+        if dce is not None and variant is not dce:
+            chance = f"{probability_of_improvement([evidence.last(dce, name) for name in ids], scores):.2f}"
+        printed = [None if variant.paper is None else paper_score(name, variant.paper) for name in paper_rows]
+        known = [cell.score for cell in printed if cell is not None and cell.score is not None]
+        rows.append(
+            (
+                variant.name,
+                *(f"{value:.1f}" for value in (sums.mean, sums.paper_std, sums.std, mean_of_tasks(scores), iqm(scores))),
+                f"{low:.1f} to {high:.1f}",
+                chance,
+                str(sum(len(task) for task in scores)),
+                f"{sum(known):.1f}" if len(known) == len(printed) else "-",
+            )
+        )
+    note = (
+        f"Over the {len(ids)} data sets on which all agents have runs. The interval is a stratified bootstrap over seeds "
+        "within data sets (2,000 resamples); the deviation of the total takes the rows as independent."
+    )
+    return TextTable(header, tuple(rows), f"{evidence.caption(ids, variants)} {note}")
+
+
+def runtime_table(evidence: Evidence) -> TextTable:
+    """
+    :param evidence: of an experiment with a table
+    :return: seconds per 1000 updates beside the paper's
+    """
+    rows = []
+    ids = [name for _, name in evidence.table_rows()]
+    for variant in evidence.experiment.variants:
+        rates = seconds_per_1000(evidence, variant, ids)
+        cell = None if variant.paper is None else paper_scores().get(("gym", "runtime-s", variant.paper))
+        printed = "-" if cell is None or cell.score is None else f"{cell.score:g}"
+        if len(rates):
+            rows.append((variant.name, f"{np.median(rates):.1f}", f"{rates.min():.1f} to {rates.max():.1f}", printed))
+    note = "Wall time with evaluations, of runs side by side on a shared machine: an order, no benchmark."
+    header = ("agent", "s per 1000 updates (median)", "range", "paper: s per 1000, RTX 3070")
+    return TextTable(header, tuple(rows), f"{evidence.caption(ids)} {note}")
+
+
+def seconds_per_1000(evidence: Evidence, variant: Variant, dataset_ids: list[str]) -> np.ndarray:
+    """
+    :param evidence: rows
+    :param variant: agent
+    :param dataset_ids: data
+    :return: of each complete run
+    """
+    rates = [
+        1000.0 * evidence.last(variant, name, "seconds") / (evidence.n_updates(name) or 1)
+        for name in dataset_ids
+        if len(evidence.last(variant, name, "seconds"))
+    ]
+    return np.concatenate(rates) if rates else np.empty(0)
+
+
+def long_table(evidence: Evidence) -> TextTable:
+    """
+    :param evidence: rows
+    :return: one line per data and agent, for programs: last score, mean of the last ten evaluations, best, per seed
+    """
+    header = (
+        *("dataset", "source", "agent", "hyperparameters", "n_updates", "n_seeds", "n_diverged", "mean", "std", "ci_low"),
+        *("ci_high", "mean_paper_episodes", "mean_last_10_evaluations", "mean_best_evaluation", "scores"),
+        *("paper_dataset", "paper_score", "paper_std"),
+    )
+    rows = []
+    for dataset, name in evidence.table_rows():
+        for variant in evidence.variants(dataset):
+            scores = evidence.last(variant, name)
+            lost = evidence.n_diverged(variant, name)
+            if not len(scores) and not lost:
+                continue
+            numbers = ["", "", "", "", "", "", "", ""]
+            if len(scores):
+                low, high = bootstrap_interval([scores])
+                few = evidence.last(variant, name, "score_paper_episodes")
+                curve = evidence.curve(variant, name, "score")
+                paper_mode = float(few.mean()) if len(few) else float("nan")
+                late = (float(curve.tail(10).mean().mean()), float(curve.max().mean()))
+                values = (float(scores.mean()), sample_std(scores), low, high, paper_mode, *late)
+                numbers = [f"{v:.4f}" for v in values] + [" ".join(f"{s:.4f}" for s in scores)]
+            cell = None if variant.paper is None else paper_score(dataset.paper, variant.paper)
+            printed = ["" if v is None else f"{v:g}" for v in ((None, None) if cell is None else (cell.score, cell.std))]
+            settings = evidence.runs(variant, name)["hyperparameters"].iloc[0]
+            length = str(evidence.n_updates(name))
+            start = [name, source_of(name), variant.name, settings, length, str(len(scores)), str(lost)]
+            rows.append((*start, *numbers, dataset.paper, *printed))
+    return TextTable(header, tuple(rows), "")
+
+
+def _latex(text: str) -> str:
+    for sign in ("\\", "&", "%", "_", "#", "$", "{", "}"):
+        text = text.replace(sign, r"\textbackslash " if sign == "\\" else f"\\{sign}")
+    text = text.replace("±", r"$\pm$").replace("…", r"\dots{}").replace("`", "").replace(">", "$>$")
+    parts = text.split("**")
+    return "".join(rf"\textbf{{{part}}}" if i % 2 else part for i, part in enumerate(parts))

@@ -1,0 +1,367 @@
+"""
+What the paper claims, and whether our rows bear it out: each claim by a rule that is stated, on numbers that are shown.
+
+"held" and "did not hold" are about these data and these lengths, no more; "could not be tested" is for missing runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_dce.dce_probe import PROBE_BETAS
+from sb3_dce.experiments.evidence import Evidence
+from sb3_dce.experiments.figures import probe_difference
+from sb3_dce.experiments.tables import seconds_per_1000
+
+HELD, NOT_HELD, UNTESTED = "held", "did not hold", "could not be tested"
+
+
+class Verdict(NamedTuple):
+    """
+    :param claim: of the paper
+    :param rule: when it counts as borne out
+    :param outcome: "held", "did not hold" or "could not be tested"
+    :param numbers: what the rule was applied to
+    """
+
+    claim: str
+    rule: str
+    outcome: str
+    numbers: str
+
+
+def verdicts(evidence: Evidence) -> list[Verdict]:
+    """
+    :param evidence: rows of one experiment
+    :return: one verdict per claim it tests
+    """
+    return [verdict for test in _TESTS.get(evidence.experiment.id, ()) for verdict in test(evidence)]
+
+
+def judge(claim: str, rule: str, holds: bool | None, numbers: str) -> Verdict:
+    """
+    :param claim: of the paper
+    :param rule: applied
+    :param holds: outcome, ``None`` without the runs it needs
+    :param numbers: shown
+    :return: verdict
+    """
+    outcome = UNTESTED if holds is None else HELD if holds else NOT_HELD
+    return Verdict(claim, rule, outcome, numbers if holds is not None else numbers or "runs are missing")
+
+
+def _values(evidence: Evidence, names: list[str], metric: str, dataset: str | None = None) -> dict[str, float] | None:
+    """Value of each variant at the end of its runs: mean of the last tenth, over seeds. None if one is missing."""
+    dataset_id = evidence.id_of(dataset)
+    if dataset_id is None:
+        return None
+    values = {}
+    for name in names:
+        value = evidence.tail(evidence.experiment.variant(name), dataset_id, metric)
+        if value is None:
+            return None
+        values[name] = value
+    return values
+
+
+def _text(values: dict[str, float] | None, digits: int = 1) -> str:
+    return "" if values is None else ", ".join(f"{name}: {value:.{digits}f}" for name, value in values.items())
+
+
+def _falling(values: dict[str, float] | None) -> bool | None:
+    return None if values is None else bool(np.all(np.diff(list(values.values())) < 0))
+
+
+def _rising(values: dict[str, float] | None) -> bool | None:
+    return None if values is None else bool(np.all(np.diff(list(values.values())) > 0))
+
+
+TENTH = "means over the last tenth of the run"
+
+
+def _beta(evidence: Evidence) -> list[Verdict]:
+    betas = ["beta 0", "beta 2", "beta 4", "beta 8"]
+    returns, q_values = _values(evidence, betas, "score"), _values(evidence, betas, "q_data")
+    others = [_values(evidence, [name], "score") for name in ("BC", "SAC without V")]
+    bc, sac = (None if other is None else next(iter(other.values())) for other in others)
+    gaps = _values(evidence, betas[1:], "gap_td")
+    units = {name: evidence.beta_eff(evidence.experiment.variant(name), evidence.id_of(None) or "") for name in betas[1:]}
+    shown = {**(returns or {}), **({} if bc is None else {"BC": bc}), **({} if sac is None else {"SAC without V": sac})}
+    best = None if returns is None else max(returns, key=returns.__getitem__)
+    tests = [
+        judge(
+            "With beta 0 the agent does badly: below BC",
+            f"score of beta 0 below that of BC ({TENTH})",
+            None if returns is None or bc is None else returns["beta 0"] < bc,
+            _text(shown),
+        ),
+        judge(
+            "With beta 0 it is better than SAC without V",
+            f"score of beta 0 above that of SAC without V ({TENTH})",
+            None if returns is None or sac is None else returns["beta 0"] > sac,
+            _text(shown),
+        ),
+        judge(
+            "Beta 8 is too much, the best lies between",
+            f"the best score is at beta 2 or 4, and beta 8 is below it ({TENTH})",
+            None if best is None else best in ("beta 2", "beta 4"),
+            _text(returns),
+        ),
+        judge("In-data Q falls as beta rises", f"Q of beta 0 > 2 > 4 > 8 ({TENTH})", _falling(q_values), _text(q_values)),
+        judge(
+            "Q on the data equals r + gamma V - beta_eff (gap_td near zero)",
+            f"abs(gap_td) < 0.2 beta_eff for beta 2, 4, 8 ({TENTH})",
+            None if gaps is None else all(abs(gaps[name]) < 0.2 * units[name] for name in gaps),
+            _text(gaps, 3),
+        ),
+    ]
+    return [*tests, *_shift(evidence)]
+
+
+def _shift(evidence: Evidence) -> list[Verdict]:
+    """Measured lowering of Q and V against theory."""
+    dataset_id, experiment = evidence.id_of(None), evidence.experiment
+    found = []
+    for of, letter in (("q_data", "Q"), ("value", "V")):
+        ratios: dict[str, float] = {}
+        for name in ("beta 2", "beta 4", "beta 8"):
+            if dataset_id is None:
+                continue
+            lowered, theory = evidence.shift(experiment.variant(name), experiment.variant("beta 0"), dataset_id, of)
+            late = lowered.index > 0.9 * (evidence.n_updates(dataset_id) or 0)
+            if lowered.empty or not late.any():
+                continue
+            ratios[name] = float(lowered[late].mean().mean() / theory[late].mean())
+        found.append(
+            judge(
+                f"{letter} on the data is lowered by (1 - gamma^(n+1)) / (1 - gamma) beta, in proportion to beta",
+                f"measured shift against that of beta 0, divided by theory's with beta_eff, is in [0.8, 1.2] ({TENTH})",
+                None if len(ratios) < 3 else all(0.8 <= ratio <= 1.2 for ratio in ratios.values()),
+                _text(ratios, 2),
+            )
+        )
+    return found
+
+
+def _bounds(evidence: Evidence) -> list[Verdict]:
+    dataset_id, experiment = evidence.id_of(None), evidence.experiment
+    shares: dict[str, float] = {}
+    for name in ("beta 2", "beta 4", "beta 8"):
+        if dataset_id is None:
+            continue
+        variant = experiment.variant(name)
+        lowered, _ = evidence.shift(variant, experiment.variant("beta 0"), dataset_id)
+        if not lowered.empty:
+            shares[name] = float(lowered.mean(axis=1).max() / (100.0 * evidence.beta_eff(variant, dataset_id)))
+    bound = judge(
+        "The penalty lowers Q by at most the bound of Eq. 14",
+        "largest measured shift, with the density ratio 1 and n infinite, divided by beta_eff / (1 - gamma), is at most 1.05",
+        None if len(shares) < 3 else max(shares.values()) <= 1.05,
+        _text(shares, 2),
+    )
+    return [bound, *_shift(evidence)]
+
+
+def _ood(evidence: Evidence) -> list[Verdict]:
+    dataset_id, probe = evidence.id_of(None), evidence.experiment.variant("probe")
+    found = []
+    for metric, text, betas in (
+        ("probe_policy", "Q of the policy's actions, less that of beta 0, is lower with a larger beta", PROBE_BETAS),
+        ("probe_max", "max OOD Q - in-data Q is lower with a larger beta", (0, *PROBE_BETAS)),
+        ("probe_min", "min OOD Q - in-data Q is lower with a larger beta", (0, *PROBE_BETAS)),
+    ):
+        values: dict[str, float] | None = {}
+        for beta in betas:
+            curve = None if dataset_id is None else probe_difference(evidence, probe, dataset_id, metric, beta)
+            if curve is None or curve.empty or values is None:
+                values = None
+                continue
+            late = curve[curve.index > 0.9 * (evidence.n_updates(dataset_id or "") or 0)]
+            values[f"beta {beta}"] = float(late.mean().mean())
+        found.append(judge(text, f"ordered by beta ({TENTH})", _falling(values), _text(values)))
+    return found
+
+
+def _alpha(evidence: Evidence) -> list[Verdict]:
+    betas = [f"beta {b}" for b in (0, 1, 2, 4, 8)]
+    first = evidence.experiment.datasets[0].paper
+    values = _values(evidence, betas, "ent_coef", first)
+    found = [
+        judge(
+            "The learned alpha rises with beta, within a range",
+            f"alpha of beta 4 above that of beta 1, and beta 1 < 2 < 4 ({TENTH})",
+            None if values is None else values["beta 1"] < values["beta 2"] < values["beta 4"],
+            _text(values, 4),
+        )
+    ]
+    for panel in evidence.experiment.panels:
+        if panel.over:
+            alphas = {}
+            for paper in panel.over:
+                name = evidence.id_of(paper)
+                value = None if name is None else evidence.tail(evidence.experiment.variant("beta 4"), name, "ent_coef")
+                if name is not None and value is not None:
+                    alphas[name] = value
+            spread = None if len(alphas) < 2 else max(alphas.values()) / min(alphas.values()) > 2.0
+            claim = f"Alpha differs between data sets ({(panel.title or '').partition(',')[0]})"
+            found.append(judge(claim, f"largest / smallest above 2 ({TENTH})", spread, _text(alphas, 4)))
+    return found
+
+
+def _tau(evidence: Evidence) -> list[Verdict]:
+    names = [v.name for v in evidence.experiment.variants]
+    found = []
+    for dataset, little in (("halfcheetah-medium-v2", True), ("relocate-cloned-v0", False), ("kitchen-mixed-v0", False)):
+        values = _values(evidence, names, "score", dataset)
+        spread = None if values is None else max(values.values()) - min(values.values())
+        word = "makes little difference" if little else "matters"
+        rule = f"largest - smallest score {'below' if little else 'at least'} 10 ({TENTH})"
+        holds = None if spread is None else (spread < 10.0) == little
+        found.append(judge(f"The expectile {word} on {dataset}'s kind of data", rule, holds, _text(values)))
+    return found
+
+
+def _cql_q(evidence: Evidence) -> list[Verdict]:
+    levels = _values(evidence, ["expectile 0.5", "expectile 0.7", "expectile 0.9"], "q_data")
+    rule = f"in-data Q of expectile 0.5 < 0.7 < 0.9 ({TENTH})"
+    found = [judge("A higher expectile gives a higher Q (a slacker estimate)", rule, _rising(levels), _text(levels))]
+    dataset_id = evidence.id_of(None)
+    slopes: dict[str, float] = {}
+    for name in ("expectile 0.7", "without policy"):
+        curve = None if dataset_id is None else evidence.curve(evidence.experiment.variant(name), dataset_id, "q_data")
+        if curve is not None and len(curve) > 3:
+            slopes[name] = float(curve.mean(axis=1).iloc[len(curve) // 2 :].std())
+    holds = None if len(slopes) < 2 else slopes["without policy"] < slopes["expectile 0.7"]
+    rule = "standard deviation of the curve over its second half is smaller"
+    return [*found, judge("Without a policy in the penalty Q is flatter", rule, holds, _text(slopes, 2))]
+
+
+def _cql_return(evidence: Evidence) -> list[Verdict]:
+    found = []
+    for dataset, better in (("halfcheetah-medium-v2", "Eq. 18"), ("relocate-cloned-v0", "DCE"), ("kitchen-mixed-v0", "DCE")):
+        values = _values(evidence, ["DCE", "Eq. 18"], "score", dataset)
+        other = "DCE" if better == "Eq. 18" else "Eq. 18"
+        holds = None if values is None else values[better] > values[other]
+        claim = f"{better} is better on {dataset}'s kind of data"
+        found.append(judge(claim, f"higher score ({TENTH})", holds, _text(values)))
+    return found
+
+
+def _sac(evidence: Evidence) -> list[Verdict]:
+    found = []
+    for alpha in ("alpha 1", "alpha auto"):
+        names = [f"SAC, {alpha}", f"SAC with V, {alpha}"]
+        q_values, scores = (_values(evidence, names, metric) for metric in ("q_data", "score"))
+        bc = _values(evidence, ["BC"], "score")
+        lower = None if q_values is None else q_values[names[1]] < 0.5 * q_values[names[0]]
+        better = None if scores is None else scores[names[1]] > scores[names[0]]
+        below = None if scores is None or bc is None else scores[names[1]] < bc["BC"]
+        rule = f"Q of SAC with V below half of that of SAC ({TENTH})"
+        found += [
+            judge(f"V alone makes Q far lower (paper: 4000 and 400), {alpha}", rule, lower, _text(q_values)),
+            judge(f"SAC with V returns more than SAC, {alpha}", f"higher score ({TENTH})", better, _text(scores)),
+            judge(
+                f"V alone is not enough, {alpha}",
+                f"score of SAC with V below that of BC ({TENTH})",
+                below,
+                _text({**(scores or {}), **(bc or {})}),
+            ),
+        ]
+    return found
+
+
+def _alpha_return(evidence: Evidence) -> list[Verdict]:
+    names = [v.name for v in evidence.experiment.variants]
+    values = _values(evidence, names, "score")
+    checks: list[tuple[str, str, Callable[[dict[str, float]], bool]]] = [
+        (
+            "At alpha 3 both are below alpha 1",
+            "scores",
+            lambda v: v["DCE, alpha 3"] < v["DCE, alpha 1"] and v["Eq. 18, alpha 3"] < v["Eq. 18, alpha 1"],
+        ),
+        ("At alpha 3 DCE is above Eq. 18", "scores", lambda v: v["DCE, alpha 3"] > v["Eq. 18, alpha 3"]),
+        (
+            "At alpha 5 Eq. 18 fails and DCE works",
+            "score of Eq. 18 below half of its score at alpha 1, that of DCE not",
+            lambda v: v["Eq. 18, alpha 5"] < 0.5 * v["Eq. 18, alpha 1"] and v["DCE, alpha 5"] >= 0.5 * v["DCE, alpha 1"],
+        ),
+    ]
+    return [judge(c, f"{r} ({TENTH})", None if values is None else t(values), _text(values)) for c, r, t in checks]
+
+
+def _table(evidence: Evidence) -> list[Verdict]:
+    ids = [name for _, name in evidence.table_rows()]
+    rates = {v.name: seconds_per_1000(evidence, v, ids) for v in evidence.experiment.variants}
+    order = {name: float(np.median(rates[name])) for name in ("BC", "IQL", "DCE", "CQL", "UWAC") if len(rates.get(name, ()))}
+    claim = "Run times are in the order BC < IQL < DCE < CQL << UWAC"
+    rule = "medians of the seconds per 1000 updates, evaluations included"
+    return [judge(claim, rule, _rising(order) if len(order) == 5 else None, _text(order)), *_leading(evidence)]
+
+
+def _leading(evidence: Evidence) -> list[Verdict]:
+    """The paper's statements on where DCE is first, on our rows."""
+    kinds: dict[str, tuple[str, tuple[str, ...]]] = {
+        "C4: DCE is best on every HalfCheetah set": ("halfcheetah", ("random", "medium", "medium-replay", "medium-expert")),
+        "C5: DCE is better on random, medium and medium-replay sets": ("", ("random", "medium", "medium-replay")),
+        "C6: DCE has no advantage on medium-expert sets": ("", ("medium-expert",)),
+    }
+    found = []
+    for claim, (task, endings) in kinds.items():
+        places = {}
+        for dataset, name in evidence.table_rows():
+            kind = dataset.paper.removesuffix("-v2").partition("-")[2]
+            means = {
+                v.name: float(evidence.last(v, name).mean())
+                for v in evidence.experiment.variants
+                if v.paper is not None and len(evidence.last(v, name))
+            }
+            if dataset.paper.startswith(task) and kind in endings and "DCE" in means and len(means) > 1:
+                places[name] = 1 + sum(value > means["DCE"] for value in means.values())
+        wanted = sum(d.paper.startswith(task) and d.paper.removesuffix("-v2").partition("-")[2] in endings
+                     for d in evidence.experiment.datasets)  # fmt: skip
+        first = sum(place == 1 for place in places.values())
+        holds = None
+        if len(places) >= max(1, wanted):
+            holds = first == 0 if claim.startswith("C6") else first == len(places)
+        rule = "DCE's mean is the highest of the agents that were run" + (
+            " nowhere" if claim.startswith("C6") else " everywhere"
+        )
+        found.append(judge(claim, rule, holds, f"place of DCE: {_text({k: float(v) for k, v in places.items()}, 0)}"))
+    return found
+
+
+def _adroit(evidence: Evidence) -> list[Verdict]:
+    experiment = evidence.experiment
+    with_, without = experiment.variant("DCE"), experiment.variant("DCE without dropout")
+    pairs = {}
+    for dataset, name in evidence.table_rows():
+        if dataset.paper in (without.datasets or ()):
+            scores = [evidence.last(v, name) for v in (with_, without)]
+            if all(map(len, scores)):
+                pairs[name] = (float(scores[0].mean()), float(scores[1].mean()))
+    numbers = ", ".join(f"{name}: {a:.1f} with, {b:.1f} without" for name, (a, b) in pairs.items())
+    holds = None if not pairs else all(a > b for a, b in pairs.values())
+    rule = "mean score with dropout 0.1 is higher on every set that was run"
+    found = [judge("E26: dropout of the critics helps on human demonstrations", rule, holds, numbers)]
+    spreads = {n: float(np.std(s, ddof=1)) for _, n in evidence.table_rows() if len(s := evidence.last(with_, n)) > 1}
+    wide = None if not spreads else max(spreads.values()) > 15.0
+    rule = "largest standard deviation over seeds above 15 (paper: 37 on pen-human)"
+    return [*found, judge("C9, E27: a constant alpha gives high variance over seeds", rule, wide, _text(spreads))]
+
+
+_TESTS: dict[str, tuple[Callable[[Evidence], list[Verdict]], ...]] = {
+    "table1": (_table,),
+    "table-adroit-kitchen": (_adroit,),
+    "fig-tau": (_tau,),
+    "fig-beta": (_beta,),
+    "fig-ood": (_ood,),
+    "fig-alpha": (_alpha,),
+    "fig-cql-q": (_cql_q,),
+    "fig-cql-return": (_cql_return,),
+    "fig-sac": (_sac,),
+    "fig-alpha-return": (_alpha_return,),
+    "bounds": (_bounds,),
+}
