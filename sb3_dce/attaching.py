@@ -115,8 +115,8 @@ class AttachingMixin(OffPolicyAlgorithm):
         self.dataset = spec.id
         return spec
 
-    def _spaces_env(self, spec: DatasetSpec | None) -> gym.Env:
-        """Environment without a simulator, from the catalogue or from the data."""
+    def _spaces_env(self, spec: DatasetSpec | None, verbose: int) -> gym.Env:
+        """Environment without a simulator, from the catalogue or from the data; the latter is said if anything is."""
         if spec is not None:
             return SpacesEnv(*dataset_spaces(spec))
         if self.dataset is None and self._transitions is None:
@@ -127,6 +127,8 @@ class AttachingMixin(OffPolicyAlgorithm):
                 hint=f"Pass env='HalfCheetah-v4', or dataset=<id or file>; {name}.load_dataset(<id>) does both.",
             )
         transitions = self._load_transitions()
+        if verbose >= 1:
+            print(f"No environment: the spaces are taken from {transitions.info.id}, {transitions.spaces_text()}")
         return SpacesEnv(
             spaces.Box(-np.inf, np.inf, transitions.obs_shape, np.float64),
             spaces.Box(transitions.info.action_space_low, transitions.info.action_space_high, dtype=np.float32),

@@ -101,7 +101,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         self.d4rl_compat = d4rl_compat
         spec = self._remember_dataset(dataset)
         if env is None and needs_env:
-            env = self._spaces_env(spec)
+            env = self._spaces_env(spec, verbose)
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]

@@ -154,6 +154,14 @@ def test_missing_official_file_is_never_replaced_by_a_stand_in(empty_machine: Pa
     assert isinstance(caught.value, FileNotFoundError) and caught.value.key == spec.id
 
 
+@pytest.mark.parametrize(("name", "twin"), [("hopper-expert", "hopper-expert-sb3"), ("kitchen-mixed", None)])
+def test_missing_official_file_says_which_stand_in_can_be_made(name: str, twin: str | None, empty_machine: Path) -> None:
+    with pytest.raises(DatasetNotFoundError) as caught:
+        find_file(name)
+    assert ("datasets generate" in str(caught.value)) == (twin is not None)
+    assert twin is None or f"sb3-dce datasets generate {twin}." in str(caught.value)
+
+
 def test_embedded_files_need_no_folder() -> None:
     path, spec = find_file("halfcheetah-tiny-sb3")
     assert spec is not None and spec.embedded and h5py.is_hdf5(path)

@@ -138,6 +138,16 @@ def test_bounds_of_the_actions_travel_with_the_file(tmp_path: Path) -> None:
         load_dataset(tmp_path / "usual.hdf5")
 
 
+@pytest.mark.parametrize("verbose", [0, 1])
+def test_spaces_that_are_inferred_from_the_data_are_said(verbose: int, capsys: pytest.CaptureFixture[str]) -> None:
+    transitions = load_dataset(base_arrays(), action_low=[-1, -2], action_high=[1, 4])
+    words = "observations of 3 unbounded entries, actions of 2 entries in [-1, 1], [-2, 4]"
+    assert f"spaces of an agent without an environment: {words}" in transitions.summary()
+    model = OfflineBC("MlpPolicy", None, dataset=transitions, policy_kwargs={"net_arch": [4]}, verbose=verbose)
+    assert (f"No environment: the spaces are taken from arrays, {words}" in capsys.readouterr().out) == (verbose == 1)
+    assert model.observation_space.shape == (3,) and model.action_space == spaces.Box(np.float32([-1, -2]), np.float32([1, 4]))
+
+
 def test_an_agent_acts_in_the_units_of_the_data(tmp_path: Path) -> None:
     arrays = base_arrays()
     arrays["actions"] = arrays["actions"] * [50, 5] + [50, 100]

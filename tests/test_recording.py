@@ -140,6 +140,17 @@ def test_episodes_of_a_large_policy_side_by_side_are_those_one_by_one(tmp_path: 
     assert all(np.array_equal(array, single[key]) for key, array in read(made.path).items())
 
 
+@pytest.mark.parametrize("size", [{"n_rows": 5}, {"n_episodes": 1}])
+def test_small_recordings_run_no_episodes_beside_the_one_they_need(
+    size: dict[str, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    widths, run = [], EpisodeRunner._run_side_by_side
+    monkeypatch.setattr(EpisodeRunner, "_run_side_by_side", lambda self, them: widths.append(len(them)) or run(self, them))
+    large = hopper_npz(tmp_path / "large.npz", width=256)
+    record(RecordingSpec(str(large), "Hopper-v4"), tmp_path / "x.hdf5", **size)
+    assert widths == [1]
+
+
 def test_longer_recording_begins_with_the_shorter_one(tmp_path: Path) -> None:
     short, long = (read(record(RANDOM, tmp_path / f"{n}.hdf5", n_rows=n).path) for n in (50, 120))
     assert all(np.array_equal(long[key][:50], short[key]) for key in short)

@@ -146,6 +146,8 @@ def _not_found(spec: DatasetSpec) -> DatasetNotFoundError:
     hint += f", or name another folder in ${DATASETS_VARIABLE}, or give the path of the file."
     if stand_ins:
         hint += f" Similar data made with this package, to be asked for by their own name: {', '.join(stand_ins)}."
+    elif spec.url and (twin := _twin(spec)) is not None:
+        hint += f" Similar data can be made by a policy, which is trained or given: sb3-dce datasets generate {twin.id}."
     return DatasetNotFoundError(
         f"{spec.file_name} not found; searched {', '.join(map(str, search_folders()))}",
         where=f"dataset {spec.id}",
@@ -153,6 +155,12 @@ def _not_found(spec: DatasetSpec) -> DatasetNotFoundError:
         path=target,
         key=spec.id,
     )
+
+
+def _twin(spec: DatasetSpec) -> DatasetSpec | None:
+    """The set of this package with the name of an official one."""
+    name = f"{spec.id.rpartition('-')[0]}-sb3"
+    return next((twin for twin in all_specs() if twin.id == name and twin.generated), None)
 
 
 def _available_hint() -> str:

@@ -391,10 +391,20 @@ class Transitions:
             f"rewards min {info.reward_min:.4g}, mean {info.reward_mean:.4g}, max {info.reward_max:.4g}; "
             f"actions in [{info.action_low.min():.4g}, {info.action_high.max():.4g}]; all values finite",
         ]
+        lines.append(f"spaces of an agent without an environment: {self.spaces_text()}")
         if info.d4rl_compat:
             lines.append("rows as in D4RL's qlearning_dataset")
         lines += [f"note: {text}" for text in info.notes]
         return lines + [f"warning: {text}" for text in info.warnings]
+
+    def spaces_text(self) -> str:
+        """
+        :return: the spaces that these data stand for where no environment is given, in words
+        """
+        low, high = self.info.action_space_low, self.info.action_space_high
+        bounds = [f"[{a:.4g}, {b:.4g}]" for a, b in zip(low, high, strict=True)]
+        shown = bounds[0] if len(set(bounds)) == 1 else ", ".join(bounds)
+        return f"observations of {self.obs_shape[0]} unbounded entries, actions of {self.act_dim} entries in {shown}"
 
     def _returns_line(self) -> str:
         info, returns, lengths = self.info, self.info.episode_returns, self.info.episode_lengths

@@ -102,6 +102,8 @@ def record(
     name = check_target(out, name, spec.env, force)
     workers = min(workers, n_episodes or workers)
     runner = EpisodeRunner(spec)
+    # no more episodes side by side than a small recording has at least
+    runner.width = min(runner.width, n_episodes or -(-int(n_rows or 0) // runner.limit))
     folder = out.with_name(f"{out.name}.parts")
     if force:
         shutil.rmtree(folder, ignore_errors=True)
