@@ -152,6 +152,13 @@ def test_unknown_algorithm_names_the_known_ones() -> None:
         hyperparams.load_row("dcee", "pen-human-v0")
 
 
+def test_every_agent_is_described() -> None:
+    docs = Path(__file__).parents[1] / "docs"
+    text = "".join((docs / name).read_text(encoding="utf-8") for name in ("agents.md", "dce.md"))
+    for algo, cls in AGENTS.items():
+        assert cls.__name__ in text and (algo == "dce" or f"`{algo}`" in text), algo
+
+
 def test_short_names_are_completed_and_others_left_alone() -> None:
     names = ("iql", "sac", "offline_bc", "dce", "sac_v", "cql_eq18", "unknown")
     assert [hyperparams.full_name(name) for name in names] == ["offline_iql", "offline_sac", *names[2:]]

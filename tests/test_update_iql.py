@@ -370,3 +370,17 @@ def test_rows_have_the_authors_values(dataset: str, expected: tuple[Any, ...]) -
     got = tuple(row.get(name) for name in ("expectile", "temperature", "actor_dropout", "reward_normalization"))
     assert got == expected
     assert row["actor_lr_schedule"] == "cosine"
+
+
+def test_scale_of_the_rewards_is_in_the_saved_model(hdf5_file: Path, transitions: Transitions, tmp_path: Path) -> None:
+    model = OfflineIQL("MlpPolicy", dataset=hdf5_file, policy_kwargs={"net_arch": [8]}, reward_normalization="iql", seed=0)
+    model.learn(2)
+    model.save(tmp_path / "model.zip")
+    loaded = OfflineIQL.load(tmp_path / "model.zip")
+    returns = transitions.info.episode_returns
+    expected = 1000.0 / (returns.max() - returns.min())
+    assert loaded.replay_buffer.size() == 0, "no data are attached yet"
+    assert loaded.coefficients(2)["reward_scale"] == model.coefficients(2)["reward_scale"] == pytest.approx(expected, rel=1e-6)
+    for candidate in (model, loaded):
+        candidate.learn(2, reset_num_timesteps=False)
+    assert largest_difference(model.policy.state_dict(), loaded.policy.state_dict()) == 0.0
