@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
+from sb3_dce.data.catalog import resolve
 from sb3_dce.experiments.grid import EMBEDDED, Experiment, GridDataset, Scale, Variant, differences, source_of, variant_hash
 from sb3_dce.theory import beta_eff, shift_factor
 
@@ -51,6 +52,15 @@ class Evidence:
         if self.scale.source == "embedded" and names != [EMBEDDED]:
             return []
         return [name for name in names if any(len(self.runs(v, name)) for v in self.variants(dataset))]
+
+    def paper_id(self, dataset: GridDataset) -> str:
+        """
+        :param dataset: of the grid
+        :return: the paper's set whose numbers stand beside; at smoke scale that of the embedded data
+        """
+        if self.scale.source != "embedded":
+            return dataset.paper
+        return resolve(EMBEDDED).paper_row or dataset.paper
 
     def table_rows(self) -> list[tuple[GridDataset, str]]:
         """
@@ -234,7 +244,7 @@ class Evidence:
         seeds = rows.drop_duplicates(["dataset", "agent", "config_hash", "seed"])
         counts = sorted(seeds.groupby(["dataset", "agent", "config_hash"], observed=True).size().unique())
         episodes = sorted(rows[rows["metric"] == "n_episodes"]["value"].astype(int).unique())
-        small = "Smoke scale: tiny data, networks and lengths; the numbers say nothing about the agents. "
+        small = "Smoke scale, a test of the machinery: numbers and verdicts say nothing about the agents. "
         text = small if self.scale.source == "embedded" else ""
         text += f"Data: {'; '.join(data)}. Gradient steps: {_listed(lengths)}; seeds: {_listed(counts)}; last policy"
         text += f", {_listed(episodes)} episodes" if episodes else ""

@@ -43,8 +43,8 @@ def write_page(path: Path, out: Path, evidences: Mapping[str, Evidence], reports
         "# Results",
         f"Made from the result rows in `{link}rows/` by `{command}`; nothing here is typed by hand.",
         "Data whose names end in `-sb3` are made with this package. They stand in for D4RL's sets and are not these: scores "
-        "on them cannot be compared with published ones, which stand beside them in columns of their own, under the D4RL id they "
-        "belong to. Scores are those of the last policy, with D4RL's constants, in the version 4 environments.",
+        "on them cannot be compared with published ones, which stand beside them in columns of their own, under the D4RL id "
+        "they belong to. Scores are those of the last policy, with D4RL's constants, in the version 4 environments.",
         f"Verdicts: {count(every)}.",
         "## The paper's claims",
         claim_table(evidences, judged).markdown(),

@@ -12,6 +12,7 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
+from sb3_dce.data.locking import exclusive
 from sb3_dce.errors import ConfigError
 from sb3_dce.experiments import results
 from sb3_dce.experiments.evidence import Evidence
@@ -33,6 +34,8 @@ from sb3_dce.hyperparams import did_you_mean
 
 ALL = "all"
 PRESENT = "present"
+# Longest wait for another call with the same folder, seconds.
+WAIT = 7 * 24 * 3600.0
 
 
 @dataclass(frozen=True)
@@ -97,21 +100,16 @@ def reproduce(request: Request, console: Console) -> dict[str, Report]:
     for folder in (*request.reuse, *request.imports):
         if not folder.is_dir():
             raise ConfigError("no such folder", where=str(folder), key="--reuse/--import", hint="Check the path.")
-    known = results.merge([results.read_folder(request.out / "rows"), *map(results.read_folder, request.reuse)])
-    if request.report_only:
+    if not request.report_only:
+        request.out.mkdir(parents=True, exist_ok=True)
+        # two calls with one folder take turns: they may have runs in common
+        with exclusive(request.out / ".lock", limit=WAIT, note=lambda text: console.print(text, markup=False)):
+            rows = _train(request, experiments, scales, console)
+    else:
+        known = _known(request)
         rows = results.merge(
             [known, *(results.import_runs(f, request.ids[0]) for f in (request.out / "runs", *request.imports))]
         )
-    else:
-        planned = [run for e in experiments for run in _plan(e, scales[e.id], request)]
-        imported = results.merge(results.import_runs(folder, request.ids[0]) for folder in request.imports)
-        known = results.merge([known, imported])
-        _say_plan(planned, known, scales, console)
-        diverged = execute(planned, results.done_keys(known), request.workers, request.device, request.ray_address, console)
-        for text in diverged:
-            console.print(f"diverged: {text}", markup=False)
-        rows = results.merge([known, results.planned_rows(planned)])
-        _keep_rows(rows, experiments, request)
     evidences, reports = {}, {}
     for experiment in experiments:
         length = request.updates if request.report_only else scales[experiment.id].updates
@@ -121,6 +119,24 @@ def reproduce(request: Request, console: Console) -> dict[str, Report]:
         write_page(request.page, request.out, evidences, reports, _command(request))
         console.print(f"page   {request.page}", markup=False)
     return reports
+
+
+def _known(request: Request) -> pd.DataFrame:
+    return results.merge([results.read_folder(request.out / "rows"), *map(results.read_folder, request.reuse)])
+
+
+def _train(request: Request, experiments: list[Experiment], scales: dict[str, Scale], console: Console) -> pd.DataFrame:
+    """Run what is missing and keep its rows; all rows there are then."""
+    planned = [run for e in experiments for run in _plan(e, scales[e.id], request)]
+    imported = results.merge(results.import_runs(folder, request.ids[0]) for folder in request.imports)
+    known = results.merge([_known(request), imported])
+    _say_plan(planned, known, scales, console)
+    diverged = execute(planned, results.done_keys(known), request.workers, request.device, request.ray_address, console)
+    for text in diverged:
+        console.print(f"diverged: {text}", markup=False)
+    rows = results.merge([known, results.planned_rows(planned)])
+    _keep_rows(rows, request)
+    return rows
 
 
 def show_list(console: Console) -> None:
@@ -183,19 +199,19 @@ def _say_plan(planned: list[PlannedRun], known: pd.DataFrame, scales: dict[str, 
     if small is not None and runs:
         console.print(
             f"smoke scale: tiny data, {small.updates} updates, settings {small.set} {small.set_for}: a test of the machinery; "
-            "the numbers say nothing about the agents",
+            "the numbers and verdicts say nothing about the agents",
             markup=False,
         )
 
 
-def _keep_rows(rows: pd.DataFrame, experiments: list[Experiment], request: Request) -> None:
+def _keep_rows(rows: pd.DataFrame, request: Request) -> None:
     """One file per experiment; what a reused folder holds is not copied."""
-    reused = results.merge(map(results.read_folder, request.reuse))
-    own = results.without(rows, reused)
-    for name in dict.fromkeys([*(e.id for e in experiments), *own["experiment"].unique()]):
-        part = own[own["experiment"] == name]
-        if len(part):
-            results.write_rows(request.out / "rows" / f"{name}.csv.gz", part)
+    folder = request.out / "rows"
+    new = results.without(rows, _known(request))
+    for name in new["experiment"].unique():
+        path = folder / f"{name}.csv.gz"
+        before = [results.read_rows(path)] if path.is_file() else []
+        results.write_rows(path, results.merge([*before, new[new["experiment"] == name]]))
 
 
 def _report(evidence: Evidence, out: Path, console: Console) -> Report:
@@ -204,7 +220,8 @@ def _report(evidence: Evidence, out: Path, console: Console) -> Report:
     console.print(f"\n[b]{experiment.title}[/b] ({', '.join(experiment.items)})")
     written = []
     for name, table in report.tables.items():
-        written += table.write(out / "tables", f"{experiment.id}-{name}")
+        endings = ("csv",) if name == "long" else ("md", "tex", "csv")
+        written += table.write(out / "tables", f"{experiment.id}-{name}", endings)
         if name != "long":
             _show(name, table.header, table.rows, console)
     if report.has_figure:

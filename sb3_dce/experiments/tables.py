@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,16 +68,18 @@ class TextTable:
         csv.writer(text).writerows([self.header, *([c.replace("**", "") for c in row] for row in self.rows)])
         return text.getvalue()
 
-    def write(self, folder: Path, name: str) -> list[Path]:
+    def write(self, folder: Path, name: str, endings: Sequence[str] = ("md", "tex", "csv")) -> list[Path]:
         """
         :param folder: of the tables
         :param name: of the files, without ending
+        :param endings: which files
         :return: files
         """
         folder.mkdir(parents=True, exist_ok=True)
         written = []
-        for ending, text in (("md", self.markdown()), ("tex", self.latex()), ("csv", self.csv())):
-            path = folder / f"{name}.{ending}"
+        texts = {"md": self.markdown, "tex": self.latex, "csv": self.csv}
+        for ending in endings:
+            path, text = folder / f"{name}.{ending}", texts[ending]()
             with write_atomically(path) as stream:
                 stream.write(text.encode())
             written.append(path)
@@ -95,15 +98,16 @@ def score_table(evidence: Evidence) -> TextTable:
     header = ("data", *(f"ours: {v.name}" for v in variants), "D4RL set of the paper", *(f"paper: {m}" for m in methods))
     rows = []
     for dataset in evidence.experiment.datasets:
-        printed = tuple(_paper_cell(dataset.paper, method) for method in methods)
+        paper = evidence.paper_id(dataset)
+        printed = tuple(_paper_cell(paper, method) for method in methods)
         ids = evidence.ids(dataset)
         if not ids and evidence.scale.source != "embedded":
-            rows.append((f"{dataset.twin or dataset.paper}: no data", *("" for _ in variants), dataset.paper, *printed))
+            rows.append((f"{dataset.twin or dataset.paper}: no data", *("" for _ in variants), paper, *printed))
         for name in ids:
             best = _best_interval([evidence.last(v, name) for v in variants])
             cells = tuple(score_cell(evidence, v, name, best) for v in variants)
             note = f" ({dataset.note})" if dataset.note and name == dataset.twin else ""
-            rows.append((f"{name}{note}", *cells, dataset.paper, *printed))
+            rows.append((f"{name}{note}", *cells, paper, *printed))
     ids = [name for _, name in evidence.table_rows()]
     tuned = (
         "DCE has the paper's row of each dataset; the paper tuned these by evaluating online. 'One setting' has its commonest "
@@ -183,7 +187,7 @@ def aggregate_tables(evidence: Evidence) -> dict[str, TextTable]:
 def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
     variants = [v for v in evidence.experiment.variants if v.datasets is None and _has_any(evidence, v)]
     dce = next((v for v in variants if v.name == "DCE"), None)
-    paper_rows = [dataset.paper for dataset, name in evidence.table_rows() if name in ids]
+    paper_rows = [evidence.paper_id(dataset) for dataset, name in evidence.table_rows() if name in ids]
     header = (
         *("agent", "total", "paper's style of ± (sum of stds)", "std of the total"),
         *("mean", "IQM", "95 % interval of the IQM", "P(DCE > agent)", "runs", "paper: total of these rows"),
@@ -274,12 +278,13 @@ def long_table(evidence: Evidence) -> TextTable:
                 late = (float(curve.tail(10).mean().mean()), float(curve.max().mean()))
                 values = (float(scores.mean()), sample_std(scores), low, high, paper_mode, *late)
                 numbers = [f"{v:.4f}" for v in values] + [" ".join(f"{s:.4f}" for s in scores)]
-            cell = None if variant.paper is None else paper_score(dataset.paper, variant.paper)
+            paper = evidence.paper_id(dataset)
+            cell = None if variant.paper is None else paper_score(paper, variant.paper)
             printed = ["" if v is None else f"{v:g}" for v in ((None, None) if cell is None else (cell.score, cell.std))]
             settings = evidence.runs(variant, name)["hyperparameters"].iloc[0]
             length = str(evidence.n_updates(name))
             start = [name, source_of(name), variant.name, settings, length, str(len(scores)), str(lost)]
-            rows.append((*start, *numbers, dataset.paper, *printed))
+            rows.append((*start, *numbers, paper, *printed))
     return TextTable(header, tuple(rows), "")
 
 
