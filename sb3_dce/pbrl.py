@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
@@ -22,12 +21,9 @@ from sb3_dce.errors import ConfigError
 from sb3_dce.execution import Update
 from sb3_dce.networks import OfflineCritic
 from sb3_dce.noise import NoiseSpec
+from sb3_dce.ood_weight import OOD_Q, OODWeight
 from sb3_dce.state import PureNet, Storage
 from sb3_dce.steps import descend, polyak, q_data_metrics
-
-OOD_Q = "ood_q"  # name of the recorded value in the state tree
-# The adaptive weight compares the mean of the last 5 recorded values with that of the 15 before (authors' code).
-N_RECENT, N_RECORDED = 5, 20
 
 
 @dataclass(frozen=True)
@@ -41,7 +37,7 @@ class PBRLOptions:
     max_grad_norm: float | None
 
 
-class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
+class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OODWeight, OfflineAlgorithm):
     """
     Pessimistic bootstrapping: ten critics, each with its own target, whose disagreement u(s, a) is subtracted.
 
@@ -81,19 +77,11 @@ class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
     algo_name: ClassVar[str] = "offline_pbrl"
     networks = ("actor", "critic", "critic_target", "critic_prior")
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": EnsemblePolicy}
-    population_scalars = frozenset(
-        {
-            *("uncertainty_coef", "ood_weight", "ood_weight_final", "ood_weight_steps"),
-            *("ood_weight_next", "ood_weight_decay", "ood_weight_min"),
-        }
-    )
+    population_scalars = frozenset({"uncertainty_coef"})
     policy: EnsemblePolicy
     critic: OfflineCritic
     critic_target: OfflineCritic
     critic_prior: OfflineCritic | None
-    ood_q: th.Tensor | None  # Q(s, a ~ pi) of the last update, on the device
-    recorded_q: list[float]  # one value per epoch, the last 20
-    n_ood_weight_decays: int
 
     def __init__(
         self,
@@ -192,13 +180,9 @@ class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
                 key="n_critics",
                 hint=f"Write {type(self).__name__}(..., n_critics=10).",
             )
-        for name in ("uncertainty_coef", "ood_weight", "ood_weight_next", "ood_weight_min", "prior_scale"):
+        for name in ("uncertainty_coef", "prior_scale"):
             check_number(name, getattr(self, name), 0)
-        if self.ood_weight_final is not None:
-            check_number("ood_weight_final", self.ood_weight_final, 0, hint="None is a constant weight.")
-        for name in ("n_ood_actions", "ood_weight_steps", "steps_per_epoch"):
-            check_number(name, getattr(self, name), 1, integer=True)
-        check_number("ood_weight_decay", self.ood_weight_decay, 1, open_low=True, hint="The authors divide by 1.01.")
+        check_number("n_ood_actions", self.n_ood_actions, 1, integer=True)
         if self.pseudo_target_floor is not None:
             check_number("pseudo_target_floor", self.pseudo_target_floor, -float("inf"), open_low=True)
         check_optional("max_grad_norm", self.max_grad_norm)
@@ -210,26 +194,6 @@ class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
             "n_critics": self.n_critics,
             "random_prior": self.prior_scale > 0,
         }
-
-    def setup_extras(self) -> None:
-        """Create the temperature and the memory of the adaptive weight."""
-        super().setup_extras()
-        self.ood_q = th.zeros(1, device=self.device) if self.adaptive_ood_weight else None
-        if not hasattr(self, "recorded_q"):  # else a saved model is being loaded
-            self.recorded_q, self.n_ood_weight_decays = [], 0
-
-    def make_storages(self) -> dict[str, Storage]:
-        storages = super().make_storages()
-        if self.ood_q is not None:
-            storages[OOD_Q] = Storage([self.ood_q])
-        return storages
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        modules, tensors = super()._get_torch_save_params()
-        return modules, [*tensors, OOD_Q] if self.adaptive_ood_weight else tensors
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), OOD_Q]
 
     # -- what the base class needs ---------------------------------------------------------------------------------
 
@@ -267,42 +231,7 @@ class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
         return {**rates, "log_ent_coef_learning_rate": rates["actor_learning_rate"]}
 
     def coefficients(self, n_updates: int) -> dict[str, float]:
-        return {
-            **super().coefficients(n_updates),
-            "uncertainty_coef": self.uncertainty_coef,
-            "ood_weight": self.ood_weight_at(n_updates),
-            "ood_weight_next": self.ood_weight_next,
-        }
-
-    # -- weight of the pseudo-targets at s -------------------------------------------------------------------------
-
-    def ood_weight_at(self, n_updates: int) -> float:
-        """
-        :param n_updates: completed updates
-        :return: w_s of the next update; the adaptive divisions are those made so far
-        """
-        final = self.ood_weight if self.ood_weight_final is None else self.ood_weight_final
-        done = min(n_updates / self.ood_weight_steps, 1.0)
-        return (self.ood_weight + done * (final - self.ood_weight)) / self.ood_weight_decay**self.n_ood_weight_decays
-
-    def reads_state_after(self, n_updates: int) -> bool:
-        # after the first update of each epoch, as in the authors' code
-        return self.adaptive_ood_weight and (n_updates - 1) % self.steps_per_epoch == 0
-
-    def read_state(self, state: dict[str, Any]) -> None:
-        self.adapt_ood_weight(float(state[OOD_Q]))
-
-    def adapt_ood_weight(self, ood_q: float) -> None:
-        """
-        The rule applied once per epoch: lower w_s while the recorded values fall, then record one more.
-
-        :param ood_q: mean Q(s, a ~ pi) over batch, actions and critics, reward units
-        """
-        recent, before = self.recorded_q[-N_RECENT:], self.recorded_q[:-N_RECENT]
-        falling = len(before) > 0 and np.mean(recent) < np.mean(before)
-        if falling and self._n_updates > self.ood_weight_steps and self.ood_weight_at(self._n_updates) > self.ood_weight_min:
-            self.n_ood_weight_decays += 1
-        self.recorded_q = [*self.recorded_q, ood_q][-N_RECORDED:]
+        return {**super().coefficients(n_updates), "uncertainty_coef": self.uncertainty_coef}
 
 
 def update(
