@@ -17,7 +17,7 @@ from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.checks import check_choice, check_number, check_optional
 from sb3_dce.ensembles import EnsembleNet
-from sb3_dce.entropy import ENT_COEF, EntropyCoefficient, descend_ent_coef
+from sb3_dce.entropy import EntropyCoefficient, stepped_ent_coef
 from sb3_dce.execution import Update
 from sb3_dce.networks import OfflineCritic
 from sb3_dce.noise import NoiseSpec
@@ -36,7 +36,6 @@ MAX_LAGRANGE = 1e6
 class CQLOptions:
     """Choices of :func:`update` that are fixed when it is traced; see :class:`OfflineCQL` for their meaning."""
 
-    learned_ent_coef: bool
     lagrange: bool
     lagrange_form: str
     actor_q_timing: str
@@ -203,7 +202,6 @@ class OfflineCQL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
         critic, critic_target = EnsembleNet(self.critic), EnsembleNet(self.critic_target)
         settings = {name: s.settings for name, s in storages.items() if s.settings is not None}
         options = CQLOptions(
-            learned_ent_coef=ENT_COEF in storages,
             lagrange=LAGRANGE in storages,
             lagrange_form=self.lagrange_form,
             actor_q_timing=self.actor_q_timing,
@@ -272,20 +270,13 @@ def update(
     """
     s, a, s2, d = batch.observations, batch.actions, batch.next_observations, batch.dones
     r = coef["reward_scale"] * batch.rewards + coef["reward_shift"]
-    new: dict[str, Any] = {}
-    metrics: dict[str, th.Tensor] = {}
     mean, log_std, _ = actor(state["actor"].params, s)
     mean2, log_std2, _ = actor(state["actor"].params, s2)
 
     # 1 temperature; alpha is the value after its step
     a_pi, log_prob = losses.squashed_gaussian(mean, log_std, noise["actor"])
-    ent_coef = coef.get("ent_coef")
-    if options.learned_ent_coef:
-        new[ENT_COEF], metrics["ent_coef_loss"] = descend_ent_coef(
-            state[ENT_COEF], log_prob, coef["target_entropy"], coef["log_ent_coef_learning_rate"], settings[ENT_COEF]
-        )
-        ent_coef = new[ENT_COEF].params.exp()
-    assert ent_coef is not None
+    stepped, ent_coef, metrics = stepped_ent_coef(state, coef, log_prob, settings)
+    new: dict[str, Any] = {**stepped}
 
     # 2 target: each critic's best action, then the smallest critic
     a2, _ = losses.squashed_gaussian(mean2, log_std2, noise["next_actor"])

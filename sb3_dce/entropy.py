@@ -125,3 +125,22 @@ def descend_ent_coef(
 
     learner, value, _, _ = descend(loss, learner, learning_rate, settings)
     return learner, value
+
+
+def stepped_ent_coef(
+    state: dict[str, Any], coef: dict[str, th.Tensor], log_prob: th.Tensor, settings: dict[str, AdamSettings]
+) -> tuple[dict[str, Learner], th.Tensor, dict[str, th.Tensor]]:
+    """
+    A temperature that is used after its step, as in the code of CQL's and PBRL's authors.
+
+    :param state: state of the update; the temperature is learned if it has the learner ``log_ent_coef``
+    :param coef: 0-dimensional coefficients
+    :param log_prob: log-probabilities of the policy's actions, shape (batch, 1), nats
+    :param settings: optimizer constants of each learner
+    :return: changed parts of the state, temperature, metrics
+    """
+    if ENT_COEF not in state:
+        return {}, coef["ent_coef"], {}
+    rate = coef["log_ent_coef_learning_rate"]
+    learner, loss = descend_ent_coef(state[ENT_COEF], log_prob, coef["target_entropy"], rate, settings[ENT_COEF])
+    return {ENT_COEF: learner}, learner.params.exp(), {"ent_coef_loss": loss}

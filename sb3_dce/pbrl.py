@@ -16,7 +16,7 @@ from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.checks import check_number, check_optional
 from sb3_dce.ensembles import EnsembleNet, EnsemblePolicy
-from sb3_dce.entropy import ENT_COEF, EntropyCoefficient, descend_ent_coef
+from sb3_dce.entropy import EntropyCoefficient, stepped_ent_coef
 from sb3_dce.errors import ConfigError
 from sb3_dce.execution import Update
 from sb3_dce.networks import OfflineCritic
@@ -30,7 +30,6 @@ from sb3_dce.steps import descend, polyak, q_data_metrics
 class PBRLOptions:
     """Choices of :func:`update` that are fixed when it is traced; see :class:`OfflinePBRL` for their meaning."""
 
-    learned_ent_coef: bool
     prior_scale: float
     pseudo_target_floor: float | None
     record: bool
@@ -204,7 +203,6 @@ class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OODWeight, OfflineAlgor
             critics["critic_prior"] = EnsembleNet(self.critic_prior)
         settings = {name: s.settings for name, s in storages.items() if s.settings is not None}
         options = PBRLOptions(
-            learned_ent_coef=ENT_COEF in storages,
             prior_scale=self.prior_scale,
             pseudo_target_floor=self.pseudo_target_floor,
             record=OOD_Q in storages,
@@ -259,8 +257,6 @@ def update(
     """
     s, a, s2, d = batch.observations, batch.actions, batch.next_observations, batch.dones
     r = coef["reward_scale"] * batch.rewards + coef["reward_shift"]
-    new: dict[str, Any] = {}
-    metrics: dict[str, th.Tensor] = {}
     mean, log_std, _ = actor(state["actor"].params, s)
     mean2, log_std2, _ = actor(state["actor"].params, s2)
 
@@ -271,13 +267,8 @@ def update(
 
     # 1 temperature; alpha is the value after its step
     a_pi, log_prob = losses.squashed_gaussian(mean, log_std, noise["actor"])
-    ent_coef = coef.get("ent_coef")
-    if options.learned_ent_coef:
-        new[ENT_COEF], metrics["ent_coef_loss"] = descend_ent_coef(
-            state[ENT_COEF], log_prob, coef["target_entropy"], coef["log_ent_coef_learning_rate"], settings[ENT_COEF]
-        )
-        ent_coef = new[ENT_COEF].params.exp()
-    assert ent_coef is not None
+    stepped, ent_coef, metrics = stepped_ent_coef(state, coef, log_prob, settings)
+    new: dict[str, Any] = {**stepped}
 
     # 2 targets, one per critic
     a2, _ = losses.squashed_gaussian(mean2, log_std2, noise["next_actor"])
