@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_dce.data.catalog import resolve
-from sb3_dce.experiments.grid import EMBEDDED, Experiment, GridDataset, Scale, Variant, differences, source_of, variant_hash
+from sb3_dce.experiments.grid import EMBEDDED, Experiment, GridDataset, Scale, Variant, row_of, source_of, variant_hash
 from sb3_dce.theory import beta_eff, shift_factor
 
 UPDATES_PER_EPOCH = 1000
@@ -214,10 +214,7 @@ class Evidence:
         :param dataset_id: data
         :return: shift per Bellman step, reward units
         """
-        from sb3_dce import hyperparams
-
-        row = hyperparams.split_row(hyperparams.load_row(variant.algo, dataset_id)).kwargs
-        settings = {"td_loss_coef": 1.0, "beta": 4.0, **row, **variant.set}
+        settings = {"td_loss_coef": 1.0, "beta": 4.0, **row_of(variant.algo, dataset_id), **variant.set}
         return beta_eff(settings["beta"], settings["td_loss_coef"])
 
     # -- captions --------------------------------------------------------------------------------------------------
@@ -250,15 +247,6 @@ class Evidence:
         text += f", {_listed(episodes)} episodes" if episodes else ""
         text += f". Code {', '.join(sorted(rows['code_version'].unique()))} on {', '.join(sorted(rows['device'].unique()))}."
         return text
-
-
-def hyperparameters_text(variant: Variant, dataset_id: str) -> str:
-    """
-    :param variant: of a grid
-    :param dataset_id: data
-    :return: what differs from the dataset's row, for a footnote
-    """
-    return differences(variant.algo, dataset_id, variant.set)
 
 
 def _commonest(values: pd.Series) -> str:

@@ -13,6 +13,7 @@ import inspect
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -277,7 +278,7 @@ def differences(algo: str, dataset_id: str | None, overrides: dict[str, Any]) ->
     :param overrides: constructor arguments that replace those of the row
     :return: JSON of those that differ from the row and, where it is silent, from the constructor's defaults
     """
-    in_force = {**_defaults(algo), **hyperparams.split_row(hyperparams.load_row(algo, dataset_id)).kwargs}
+    in_force = {**_defaults(algo), **row_of(algo, dataset_id)}
     return _json({k: v for k, v in overrides.items() if k not in NOT_HYPERPARAMETERS and in_force.get(k) != v})
 
 
@@ -303,10 +304,21 @@ def variant_hash(variant: Variant, dataset_id: str, scale: Scale | None = None) 
     :param scale: adds its own arguments
     :return: hash of the run's configuration, as it stands in the rows
     """
-    row = hyperparams.split_row(hyperparams.load_row(variant.algo, dataset_id)).kwargs
+    row = row_of(variant.algo, dataset_id)
     return config_hash(variant.algo, {**_defaults(variant.algo), **row, **_overrides(variant, scale)})
 
 
+@cache
+def row_of(algo: str, dataset_id: str | None) -> dict[str, Any]:
+    """
+    :param algo: name of the agent
+    :param dataset_id: id of the catalogue
+    :return: constructor arguments of the row that applies, not to be changed; the files are read once
+    """
+    return hyperparams.split_row(hyperparams.load_row(algo, dataset_id)).kwargs
+
+
+@cache
 def _defaults(algo: str) -> dict[str, Any]:
     return {name: p.default for name, p in inspect.signature(agent_class(algo)).parameters.items() if name[0] != "_"}
 
@@ -416,5 +428,6 @@ def _grids() -> Any:
     return resources.files("sb3_dce.experiments") / "grids"
 
 
+@cache
 def _read(name: str) -> dict[str, Any]:
     return yaml.safe_load((_grids() / name).read_text(encoding="utf-8"))

@@ -6,11 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_dce import hyperparams
 from sb3_dce.dce import OfflineDCE
 from sb3_dce.experiments import diagnosis, tables
 from sb3_dce.experiments.evidence import Evidence
-from sb3_dce.experiments.grid import source_of
+from sb3_dce.experiments.grid import row_of, source_of
 from sb3_dce.experiments.paper import paper_score, read_csv
 from sb3_dce.experiments.statistics import bootstrap_interval
 from sb3_dce.experiments.tables import TextTable
@@ -153,7 +152,7 @@ def config_table() -> TextTable:
     rows = []
     for printed in read_csv("paper_config.csv"):
         name = printed["dataset"]
-        ours = hyperparams.split_row(hyperparams.load_row("dce", name)).kwargs
+        ours = row_of("dce", name)
         beta, final, rate = ours["beta"], ours["beta_final"], ours["beta_rate"]
         every = ours["beta_update_every"] * ours["steps_per_epoch"]
         schedule = StepSchedule(beta, final, rate, every)
@@ -176,7 +175,7 @@ def common_table() -> TextTable:
     """
     :return: the common configuration as printed and as in our file
     """
-    ours = hyperparams.split_row(hyperparams.load_row("dce", "halfcheetah-medium-v2")).kwargs
+    ours = row_of("dce", "halfcheetah-medium-v2")
     cells = [(text, printed, str(ours[name]), f"`{name}`") for text, printed, name in COMMON]
     note = (
         f"`zoo_hyperparams/{OfflineDCE.algo_name}.yml`. Batch size and hidden layers of the ancestors where none is printed."

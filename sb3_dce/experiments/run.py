@@ -11,11 +11,10 @@ import torch as th
 from rich.console import Console
 from stable_baselines3.common.utils import get_device
 
-from sb3_dce import hyperparams
 from sb3_dce.agents import agent_class
 from sb3_dce.data.catalog import resolve
 from sb3_dce.errors import DivergenceError
-from sb3_dce.experiments.grid import PlannedRun
+from sb3_dce.experiments.grid import PlannedRun, row_of
 from sb3_dce.experiments.probe import prepare_probe
 from sb3_dce.launch import launch_all
 from sb3_dce.population import SCALARS
@@ -103,8 +102,8 @@ def populations(specs: Iterable[RunSpec]) -> list[list[RunSpec]]:
     for spec in specs:
         cls, data = agent_class(spec.algo), resolve(spec.dataset)
         free = SCALARS.union(*(getattr(base, "population_scalars", ()) for base in cls.__mro__))
-        row = hyperparams.split_row(hyperparams.load_row(spec.algo, data.id)).kwargs
-        fixed = {k: v for k, v in {**row, **spec.overrides}.items() if k not in free}
+        settings = {**row_of(spec.algo, data.id), **spec.overrides}
+        fixed = {k: v for k, v in settings.items() if k not in free}
         shape = (data.obs_dim, data.act_dim)
         key = (spec.algo, shape, repr(sorted(fixed.items())), spec.n_updates, spec.eval_freq, spec.n_eval_episodes)
         groups.setdefault(key, []).append(spec)
