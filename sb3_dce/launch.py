@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import multiprocessing as mp
-import multiprocessing.connection
 import os
 import queue
-import signal
 import sys
-import threading
 import traceback
 from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -22,6 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from sb3_dce import runs
 from sb3_dce.errors import DivergenceError, SB3DCEError
 from sb3_dce.evaluation import Evaluation
+from sb3_dce.processes import prepare_worker
 from sb3_dce.runs import RunSpec
 
 # With more runs than this the bars of those that are done make room for the others.
@@ -140,17 +138,8 @@ _events: Any = None
 def _prepare(threads: int, events: Any) -> None:
     global _events
     _events = events
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends its workers
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    prepare_worker()
     th.set_num_threads(threads)
-
-
-def _end_with_parent() -> None:
-    """A parent that was killed cannot end its workers: left alone they would write into runs that are begun again."""
-    parent = mp.parent_process()
-    assert parent is not None
-    mp.connection.wait([parent.sentinel])
-    os._exit(1)
 
 
 def _run(spec: RunSpec) -> dict[str, Any]:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -217,6 +221,28 @@ def test_interrupted_recording_goes_on_where_it_was(tmp_path: Path, monkeypatch:
     assert out.read_bytes() == whole.path.read_bytes()
     assert 0 < made.new_rows < whole.new_rows - 200
     assert sorted(path.name for path in tmp_path.iterdir()) == ["whole.hdf5", "x.hdf5"]
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="children are found as on Linux")
+def test_workers_of_a_killed_recording_end_with_it(tmp_path: Path) -> None:
+    code = (
+        "import pathlib, sys; from sb3_dce.recording import RecordingSpec, record; "
+        "record(RecordingSpec('random', 'Pendulum-v1'), pathlib.Path(sys.argv[1]), n_rows=10**9, workers=2)"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "x.hdf5")])
+    wait_until(lambda: len(list((tmp_path / "x.hdf5.parts").glob("*.npz"))) > 0)
+    workers = [Path("/proc") / pid for pid in Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()]
+    assert len(workers) >= 2
+    parent.kill()
+    parent.wait()
+    wait_until(lambda: not any(worker.exists() for worker in workers))
+
+
+def wait_until(condition: Callable[[], bool], seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
 
 
 @pytest.mark.usefixtures("frequent_progress")

@@ -7,7 +7,6 @@ import os
 import platform
 import re
 import shutil
-import signal
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping
@@ -29,6 +28,7 @@ from sb3_dce.data.records import bounds_attribute
 from sb3_dce.errors import ConfigError, DatasetError, SB3DCEError
 from sb3_dce.files import check_writable
 from sb3_dce.numpy_policy import NumpyPolicy
+from sb3_dce.processes import prepare_worker
 from sb3_dce.recording.episodes import Arrays, EpisodeRunner, RecordingSpec, dataset_of_env
 from sb3_dce.recording.parts import Parts
 
@@ -360,7 +360,7 @@ _runner: EpisodeRunner | None = None
 
 def _prepare(spec: RecordingSpec, policy: NumpyPolicy) -> None:
     global _runner
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends its workers
+    prepare_worker()
     _runner = EpisodeRunner(spec, policy)
 
 
