@@ -229,6 +229,7 @@ def test_batched_critics_train_like_critics_one_by_one(transitions: Transitions,
     assert largest_difference(tensors_of(one_by_one), tensors_of(batched)) <= 1e-12
 
 
+@pytest.mark.slow  # its graph is the largest but those of PBRL and UWAC
 @needs_compiler
 def test_compiled_update_equals_the_eager_one(transitions: Transitions) -> None:
     settings = {"n_actions": 2, "lagrange_threshold": 5.0}
