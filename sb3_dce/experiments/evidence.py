@@ -35,6 +35,7 @@ class Evidence:
         self.experiment, self.scale = experiment, scale
         self._rows, self._n_updates = rows, n_updates
         self._selected: dict[str, pd.DataFrame] = {}
+        self._runs: dict[tuple[str, str], pd.DataFrame] = {}
         self.left_out = 0
 
     # -- which data ------------------------------------------------------------------------------------------------
@@ -113,9 +114,12 @@ class Evidence:
         :param dataset_id: data
         :return: rows of its runs
         """
-        rows = self._of_dataset(dataset_id)
-        wanted = variant_hash(variant, dataset_id, self.scale)
-        return rows[(rows["agent"] == variant.algo) & (rows["config_hash"] == wanted)]
+        key = (variant.name, dataset_id)
+        if key not in self._runs:
+            rows = self._of_dataset(dataset_id)
+            wanted = variant_hash(variant, dataset_id, self.scale)
+            self._runs[key] = rows[(rows["agent"] == variant.algo) & (rows["config_hash"] == wanted)]
+        return self._runs[key]
 
     def n_updates(self, dataset_id: str) -> int | None:
         """

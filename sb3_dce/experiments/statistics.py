@@ -57,27 +57,27 @@ def trimmed_mean(values: np.ndarray) -> np.ndarray:
     return ordered @ weights / weights.sum()
 
 
-def iqm(scores: Scores) -> float:
+def iqm(scores: Scores) -> np.ndarray:
     """
     Interquartile mean over all runs of all tasks.
 
-    :param scores: one array per task
-    :return: mean of the middle half
+    :param scores: one array per task, each of shape (..., seeds)
+    :return: mean of the middle half, shape (...)
     """
-    return float(trimmed_mean(np.concatenate([np.asarray(task, dtype=float) for task in scores])))
+    return trimmed_mean(np.concatenate([np.asarray(task, dtype=float) for task in scores], axis=-1))
 
 
-def mean_of_tasks(scores: Scores) -> float:
+def mean_of_tasks(scores: Scores) -> np.ndarray:
     """
-    :param scores: one array per task
-    :return: mean over tasks of the mean over seeds
+    :param scores: one array per task, each of shape (..., seeds)
+    :return: mean over tasks of the mean over seeds, shape (...)
     """
-    return float(np.mean([np.mean(task) for task in scores]))
+    return np.mean([np.mean(task, axis=-1) for task in scores], axis=0)
 
 
 def bootstrap_interval(
     scores: Scores,
-    aggregate: Callable[[Scores], float] = mean_of_tasks,
+    aggregate: Callable[[Scores], np.ndarray] = mean_of_tasks,
     n_resamples: int = N_RESAMPLES,
     seed: int = BOOTSTRAP_SEED,
 ) -> Interval:
@@ -85,7 +85,7 @@ def bootstrap_interval(
     Stratified bootstrap: seeds are drawn anew with replacement within each task, the aggregate is computed again.
 
     :param scores: one array per task
-    :param aggregate: number of interest
+    :param aggregate: number of interest, computed along the last axis
     :param n_resamples: repetitions
     :param seed: of the draws
     :return: percentiles 2.5 and 97.5
@@ -93,8 +93,7 @@ def bootstrap_interval(
     generator = np.random.default_rng(seed)
     tasks = [np.asarray(task, dtype=float) for task in scores]
     draws = [task[generator.integers(len(task), size=(n_resamples, len(task)))] for task in tasks]
-    values = [aggregate([draw[k] for draw in draws]) for k in range(n_resamples)]
-    low, high = np.percentile(values, [2.5, 97.5])
+    low, high = np.percentile(aggregate(draws), [2.5, 97.5])
     return Interval(float(low), float(high))
 
 

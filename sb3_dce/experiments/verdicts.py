@@ -88,7 +88,8 @@ def _beta(evidence: Evidence) -> list[Verdict]:
     others = [_values(evidence, [name], "score") for name in ("BC", "SAC without V")]
     bc, sac = (None if other is None else next(iter(other.values())) for other in others)
     gaps = _values(evidence, betas[1:], "gap_td")
-    units = {name: evidence.beta_eff(evidence.experiment.variant(name), evidence.id_of(None) or "") for name in betas[1:]}
+    data = evidence.id_of(None)
+    units = {} if data is None else {n: evidence.beta_eff(evidence.experiment.variant(n), data) for n in betas[1:]}
     shown = {**(returns or {}), **({} if bc is None else {"BC": bc}), **({} if sac is None else {"SAC without V": sac})}
     best = None if returns is None else max(returns, key=returns.__getitem__)
     tests = [

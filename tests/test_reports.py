@@ -1,0 +1,246 @@
+"""Tables, verdicts, figures and the page, made from rows alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from commands import sb3_dce
+from result_rows import SHA, run_rows, table_rows
+
+from sb3_dce.experiments import results
+from sb3_dce.experiments.claims import own_table_facts
+from sb3_dce.experiments.evidence import Evidence
+from sb3_dce.experiments.figures import panel_curves
+from sb3_dce.experiments.grid import experiment_ids, load_experiment
+from sb3_dce.experiments.reports import config_table, make_report, toy_table
+from sb3_dce.experiments.tables import TextTable, aggregate_tables, score_table
+from sb3_dce.experiments.verdicts import HELD, NOT_HELD, UNTESTED, verdicts
+from sb3_dce.theory import shift_factor
+
+TABLE, BETA = load_experiment("table1"), load_experiment("fig-beta")
+AGENTS = [v.name for v in TABLE.variants]
+CHEETAH = "halfcheetah-medium-sb3"
+
+
+def evidence_of(rows: pd.DataFrame, name: str = "table1", n_updates: int | None = None) -> Evidence:
+    experiment = load_experiment(name)
+    return Evidence(experiment, rows, experiment.scales["cpu"], n_updates)
+
+
+def cell(table: TextTable, row: str, column: str) -> str:
+    (found,) = [cells for cells in table.rows if cells[0].split(" ")[0] == row]
+    return found[table.header.index(column)]
+
+
+def scores(**changes: list[float]) -> dict[str, list[float]]:
+    # where the commonest row is the dataset's own, "DCE" and "one setting" are one run
+    return {**{name: [40.0, 42.0, 44.0] for name in AGENTS}, **changes}
+
+
+def test_cells_are_mean_and_deviation_over_seeds_beside_the_papers() -> None:
+    table = score_table(evidence_of(table_rows(TABLE, {"walker2d-medium-sb3": scores(IQL=[70.0, 74.0, 81.0])})))
+    assert cell(table, "walker2d-medium-sb3", "ours: IQL") == "**75.0 ± 5.6**"
+    assert cell(table, "walker2d-medium-sb3", "ours: BC") == "42.0 ± 2.0"
+    assert cell(table, "walker2d-medium-sb3", "D4RL set of the paper") == "walker2d-medium-v2"
+    assert cell(table, "walker2d-medium-sb3", "paper: PBRL") == "**89.6 ± 0.7**"
+    ours = [i for i, title in enumerate(table.header) if title.startswith("ours")]
+    printed = [i for i, title in enumerate(table.header) if title.startswith("paper")]
+    assert max(ours) < min(printed), "two blocks, never interleaved"
+
+
+def test_bold_is_what_cannot_be_told_from_the_best() -> None:
+    close = scores(IQL=[43.0, 44.0, 45.0], BC=[10.0, 11.0, 12.0])
+    table = score_table(evidence_of(table_rows(TABLE, {"walker2d-medium-sb3": close})))
+    bold = {name: cell(table, "walker2d-medium-sb3", f"ours: {name}").startswith("**") for name in AGENTS}
+    assert bold.pop("BC") is False and all(bold.values())
+
+
+def test_rows_without_results_say_no_data() -> None:
+    table = score_table(evidence_of(table_rows(TABLE, {"walker2d-medium-sb3": scores()})))
+    assert len(table.rows) == 12
+    assert sum("no data" in row[0] for row in table.rows) == 11
+    kitchen = score_table(evidence_of(results.empty(), "table-adroit-kitchen"))
+    assert {row[0] for row in kitchen.rows} >= {f"kitchen-{kind}-v0: no data" for kind in ("complete", "partial", "mixed")}
+
+
+def test_d4rl_and_own_data_are_never_in_one_row_nor_in_one_total() -> None:
+    rows = table_rows(
+        TABLE,
+        {
+            "walker2d-medium-v2": {**scores(), "IQL": [90.0, 91.0, 92.0]},
+            "walker2d-medium-sb3": scores(),
+            "hopper-medium-sb3": scores(),
+        },
+    )
+    evidence = evidence_of(rows)
+    table = score_table(evidence)
+    assert cell(table, "walker2d-medium-v2", "ours: IQL") == "**91.0 ± 1.0**"
+    assert cell(table, "walker2d-medium-sb3", "ours: IQL") == "**42.0 ± 2.0**"
+    totals = aggregate_tables(evidence)
+    assert {source: cell(total, "IQL", "total") for source, total in totals.items()} == {"D4RL": "91.0", "sb3": "84.0"}
+    assert "walker2d-medium-v2" in totals["D4RL"].caption and "-sb3" not in totals["D4RL"].caption
+
+
+def test_two_versions_of_a_file_are_not_mixed() -> None:
+    main = table_rows(TABLE, {"walker2d-medium-sb3": scores()})
+    other = run_rows(TABLE, "DCE", "walker2d-medium-sb3", 7, 99.0, sha="cd" * 32)
+    evidence = evidence_of(results.merge([main, other]))
+    assert evidence.last(TABLE.variant("DCE"), "walker2d-medium-sb3").tolist() == [40.0, 42.0, 44.0]
+    assert evidence.left_out == 1
+
+
+def test_a_row_has_one_length_the_one_most_agents_have() -> None:
+    long = table_rows(TABLE, {"walker2d-medium-sb3": scores()}, n_updates=2000)
+    short = table_rows(TABLE, {"walker2d-medium-sb3": {"DCE": [1.0]}}, n_updates=1000)
+    rows = results.merge([long, short])
+    assert evidence_of(rows).last(TABLE.variant("DCE"), "walker2d-medium-sb3").tolist() == [40.0, 42.0, 44.0]
+    assert evidence_of(rows, n_updates=1000).last(TABLE.variant("DCE"), "walker2d-medium-sb3").tolist() == [1.0]
+
+
+def test_totals_have_the_papers_sum_of_deviations_beside_the_honest_one() -> None:
+    rows = table_rows(TABLE, {"walker2d-medium-sb3": scores(), "hopper-medium-sb3": scores()})
+    table = aggregate_tables(evidence_of(rows))["sb3"]
+    assert cell(table, "CQL", "paper's style of ± (sum of stds)") == "4.0" and cell(table, "CQL", "std of the total") == "2.8"
+    assert cell(table, "CQL", "paper: total of these rows") == "131.0", "72.5 and 58.5"
+
+
+def test_captions_name_data_hash_length_seeds_and_code() -> None:
+    caption = evidence_of(table_rows(TABLE, {CHEETAH: scores()})).caption([CHEETAH])
+    for part in (f"`{CHEETAH}` (made with this package, not D4RL's; sha256 {SHA[:8]}…)", "Gradient steps: 1,000", "seeds: 3"):
+        assert part in caption
+    assert "10 episodes" in caption and "0.1.0+0123456789" in caption and "on cpu" in caption
+    d4rl = evidence_of(table_rows(TABLE, {"hopper-medium-v2": scores()})).caption(["hopper-medium-v2"])
+    assert "`hopper-medium-v2` (D4RL; sha256" in d4rl
+
+
+def test_markdown_latex_and_csv_have_the_same_cells() -> None:
+    table = TextTable(("data", "x_1"), (("a & b", "**1.0 ± 0.5**"), ("c", "-")), "50 % of `x`")
+    assert table.markdown().splitlines()[2] == "| a & b | **1.0 ± 0.5** |"
+    assert r"a \& b & \textbf{1.0 $\pm$ 0.5} \\" in table.latex() and r"\caption{50 \% of x}" in table.latex()
+    assert table.csv().splitlines() == ["data,x_1", "a & b,1.0 ± 0.5", "c,-"]
+
+
+# -- verdicts ------------------------------------------------------------------------------------------------------
+
+
+def beta_rows(factor: float = 1.0, gap: float = 0.01, best: str = "beta 4") -> pd.DataFrame:
+    """Rows in which Q falls by ``factor`` times what theory says, at ten points of 100,000 updates."""
+    steps = [10_000 * (i + 1) for i in range(10)]
+    parts = []
+    for variant in BETA.variants:
+        unit = 0.0 if "beta" not in variant.set else variant.set["beta"] / (2 * variant.set.get("td_loss_coef", 1.0))
+        lowered = [factor * unit * shift_factor(step - 5000, 0.99, 0.005) for step in steps]
+        curves = {
+            "q_data": [400.0 - x for x in lowered],
+            "value": [399.0 - (x - factor * unit) / 0.99 for x in lowered],
+            "gap_td": [gap * unit] * 10,
+        }
+        score = {"beta 0": 20.0, "BC": 40.0, "SAC without V": 5.0, "beta 8": 10.0, best: 50.0}.get(variant.name, 45.0)
+        parts.append(run_rows(BETA, variant.name, CHEETAH, 0, score, curves, n_updates=100_000))
+    return results.merge(parts)
+
+
+def test_claims_on_beta_hold_on_rows_made_by_the_theory() -> None:
+    judged = verdicts(evidence_of(beta_rows(), "fig-beta"))
+    assert len(judged) == 7 and {verdict.outcome for verdict in judged} == {HELD}
+    assert any("beta 2: 1.00, beta 4: 1.00, beta 8: 1.00" in verdict.numbers for verdict in judged)
+
+
+@pytest.mark.parametrize(
+    ("change", "claim"),
+    [
+        ({"factor": 0.5}, "Q on the data is lowered by"),
+        ({"factor": -0.1}, "In-data Q falls"),
+        ({"gap": 0.5}, "gap_td near zero"),
+        ({"best": "beta 8"}, "Beta 8 is too much"),
+    ],
+)
+def test_claims_on_beta_fail_on_rows_that_break_them(change: dict[str, object], claim: str) -> None:
+    judged = verdicts(evidence_of(beta_rows(**change), "fig-beta"))  # type: ignore[arg-type]
+    (verdict,) = [v for v in judged if claim in v.claim]
+    assert verdict.outcome == NOT_HELD
+
+
+@pytest.mark.parametrize("name", [n for n in experiment_ids() if n not in ("bounds", "config-tables")])
+def test_without_rows_nothing_is_claimed(name: str) -> None:
+    report = make_report(evidence_of(results.empty(), name))
+    assert {verdict.outcome for verdict in report.verdicts} <= {UNTESTED}
+
+
+def test_gap_to_the_reference_is_zero_on_rows_made_by_the_theory() -> None:
+    evidence = evidence_of(beta_rows(), "fig-beta")
+    (panel,) = [p for p in BETA.panels if p.metric == "gap_ref" and p.title is None]
+    curves = panel_curves(evidence, panel)
+    assert list(curves) == ["beta 2", "beta 4", "beta 8"]
+    assert all(np.abs(curve.to_numpy()).max() < 1e-3 for curve, _ in curves.values())
+
+
+def test_reproduction_counts_rows_of_d4rl_only() -> None:
+    table = {"walker2d-medium-v2": {"DCE": [84.0, 85.0]}, "hopper-medium-v2": {"DCE": [10.0, 11.0]}}
+    rows = table_rows(TABLE, {**table, "walker2d-random-sb3": {"DCE": [0.0, 0.0]}})
+    verdict = make_report(evidence_of(rows)).verdicts[-1]
+    assert verdict.outcome == NOT_HELD and verdict.numbers.startswith(
+        "1 of 2 rows; missed: hopper-medium-v2 (10.5, paper 75.9)"
+    )
+
+
+def test_cause_of_a_loss_is_the_change_that_closes_the_gap() -> None:
+    experiment = load_experiment("why-dce-loses")
+    curves = {"survival_margin": [-0.5, 0.5]}
+    base = {"BC": 20.0, "IQL": 60.0, "DCE": 40.0, "c 0.5": 55.0, "temperature 0.2": 42.0, "beta 1": 30.0}
+    rows = results.merge(
+        run_rows(experiment, name, "hopper-medium-sb3", 0, score, curves, n_updates=1000) for name, score in base.items()
+    )
+    terminals = rows.iloc[:1].assign(metric="data_n_terminals", step=0, value=2382.0)
+    dce = rows[rows["config_hash"] == rows[rows["value"] == 40.0]["config_hash"].iloc[0]].iloc[:1]
+    fact = dce.assign(metric="data_n_terminals", step=0, value=float(terminals["value"].iloc[0]))
+    report = make_report(evidence_of(pd.concat([rows, fact], ignore_index=True), "why-dce-loses"))
+    finding = cell(report.tables["changes"], "hopper-medium-sb3", "finding")
+    assert finding == "behind IQL by 20.0: survival condition broken (margin -0.50); c 0.5 closes 75%"
+
+
+# -- facts without runs --------------------------------------------------------------------------------------------
+
+
+def test_configuration_of_all_23_rows_is_the_papers() -> None:
+    table = config_table()
+    assert len(table.rows) == 23 and {row[-1] for row in table.rows} == {"yes"}
+
+
+def test_claim_on_actions_outside_of_the_data_in_the_linear_example() -> None:
+    first, second = toy_table().rows[:2]
+    assert first[3:5] == ("-0.30", "-0.10") and second[3:5] == ("-0.70", "-0.90")
+    assert all(row[-1] == row[-2] for row in toy_table().rows)
+
+
+def test_facts_of_the_papers_own_table_are_computed() -> None:
+    facts = {row[0]: row[2] for row in own_table_facts().rows}
+    assert facts["M1"].endswith("PBRL 805.3, DCE 791.8") and facts["M3"] == "DCE has the top score in 5 of 9 rows"
+    assert facts["M4"] == "its rows sum to 157.8" and "DCE: 791.8, printed 791.7" in facts["M5"]
+    assert facts["M9"] == "sum of the row deviations: DCE 73.3; independent rows: 28.1" and len(facts) == 16
+
+
+# -- the page ------------------------------------------------------------------------------------------------------
+
+
+def test_report_from_rows_alone_is_the_same_every_time(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        rows = results.merge([beta_rows(), table_rows(TABLE, {CHEETAH: {"IQL": [40.0, 41.0]}})])
+        results.write_rows(tmp_path / name / "rows" / "all.csv.gz", rows)
+        page = tmp_path / name / "results.md"
+        arguments = ("--report-only", "--scale", "cpu", "--out", str(tmp_path / name), "--page", str(page))
+        outcome = sb3_dce("reproduce", "table1,fig-beta,fig-tau", *arguments)
+        assert outcome.code == 0, outcome.stderr
+    first = sorted(path for path in (tmp_path / "a").rglob("*") if path.is_file() and path.name != "results.md")
+    for path in first:
+        assert path.read_bytes() == (tmp_path / "b" / path.relative_to(tmp_path / "a")).read_bytes(), path.name
+    assert {"fig-beta.png", "fig-beta.svg", "table1-scores.tex", "table1-scores.md", "table1-long.csv"} <= {
+        p.name for p in first
+    }
+    page = (tmp_path / "a" / "results.md").read_text()
+    assert "![Ablation of beta](figures/fig-beta.png)" in page and "sha256 abababab…" in page
+    assert "## The paper's claims" in page and "**held**" in page and "**could not be tested**" in page
+    assert not (tmp_path / "a" / "runs").exists(), "nothing is trained"

@@ -1,0 +1,149 @@
+"""Result rows: made from run folders, each run once, written and read without loss, damaged ones refused."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from result_rows import run_rows
+
+from sb3_dce.data.catalog import normalized_score
+from sb3_dce.errors import CheckpointError
+from sb3_dce.experiments import results
+from sb3_dce.experiments.grid import load_experiment
+from sb3_dce.experiments.results import ResultsError
+from sb3_dce.runs import RunSpec, run, write_divergence
+
+TINY = "halfcheetah-tiny-sb3"
+QUICK = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 16}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a complete run as ``train`` or ``compare`` leave it."""
+    folder = tmp_path_factory.mktemp("compare") / "dce" / "seed_3"
+    run(RunSpec("dce", TINY, 3, 12, str(folder), 4, 5, QUICK))
+    return folder
+
+
+@pytest.fixture
+def made_up() -> pd.DataFrame:
+    experiment = load_experiment("fig-beta")
+    curves = {"q_data": [1.0, 2.5], "gap_td": [0.1, -0.2]}
+    return results.merge(run_rows(experiment, name, "halfcheetah-medium-sb3", 0, 40.0, curves) for name in ("beta 2", "BC"))
+
+
+def test_rows_of_a_run_hold_its_numbers(finished: Path) -> None:
+    rows = results.rows_of_run(finished, "table1")
+    assert rows is not None
+    results.check_rows(rows, "test")
+    result = json.loads((finished / "result.json").read_text())
+    last = rows[rows["step"] == 12].set_index("metric")["value"]
+    assert last["return"] == pytest.approx(result["mean_return"], rel=1e-5)
+    assert last["score"] == pytest.approx(result["normalized_score"], rel=1e-5)
+    four = normalized_score(TINY, np.mean(result["returns"][:4]))
+    assert last["score_paper_episodes"] == pytest.approx(four, rel=1e-5) and last["n_episodes"] == 5
+    assert sorted(rows[rows["metric"] == "score"]["step"]) == [4, 8, 12]
+    assert sorted(rows[rows["metric"] == "q_data"]["step"]) == [4, 8, 12]
+    assert set(rows["experiment"]) == {"table1"} and set(rows["seed"]) == {3} and set(rows["n_updates"]) == {12}
+    assert json.loads(rows["hyperparameters"].iloc[0]) == {"policy_kwargs": {"net_arch": [8]}, "batch_size": 16}
+    assert rows["code_version"].iloc[0].startswith("0.1.0")
+
+
+def test_imported_folder_is_the_run_that_a_grid_asks_for(finished: Path) -> None:
+    rows = results.import_runs(finished.parent.parent, "table1")
+    (key,) = results.done_keys(rows)
+    assert key[:2] == (TINY, "dce") and key[3:] == (12, 3)
+    assert results.merge([rows, rows]).equals(rows) and results.without(rows, rows).empty
+
+
+def test_run_that_is_not_complete_has_no_rows(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    (folder / "result.json").unlink()
+    assert results.rows_of_run(folder, "table1") is None
+    assert results.rows_of_run(tmp_path / "nowhere", "table1") is None
+
+
+def test_run_that_diverged_is_a_result(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    (folder / "result.json").unlink()
+    write_divergence(folder, 7, "critic_loss not finite")
+    rows = results.rows_of_run(folder, "table1")
+    assert rows is not None
+    assert rows[rows["metric"] == "diverged"][["step", "value"]].to_numpy().tolist() == [[7, 1.0]]
+    assert "seconds" not in set(rows["metric"])
+
+
+def test_log_of_a_run_that_was_killed_counts_each_step_once(tmp_path: Path) -> None:
+    # killed after step 30, resumed from the checkpoint at 20, with a last line cut in the middle
+    (tmp_path / "progress_0.csv").write_text("time/total_timesteps,train/q_data\n10,1.0\n20,2.0\n30,99.0\n")
+    (tmp_path / "progress_20.csv").write_text("time/total_timesteps,train/q_data\n30,3.0\n40,4.0\n40,\n50")
+    log = results.read_log(tmp_path)
+    assert log["train/q_data"].dropna().to_dict() == {10: 1.0, 20: 2.0, 30: 3.0, 40: 4.0}
+
+
+def test_written_rows_are_read_without_loss_and_always_in_the_same_bytes(made_up: pd.DataFrame, tmp_path: Path) -> None:
+    results.write_rows(tmp_path / "a.csv.gz", made_up)
+    results.write_rows(tmp_path / "b.csv.gz", made_up.sample(frac=1.0, random_state=0))
+    assert (tmp_path / "a.csv.gz").read_bytes() == (tmp_path / "b.csv.gz").read_bytes()
+    again = results.read_rows(tmp_path / "a.csv.gz")
+    order = [*results.RUN_KEY, "metric", "step"]
+    pd.testing.assert_frame_equal(
+        again.sort_values(order, ignore_index=True), made_up.sort_values(order, ignore_index=True), check_dtype=False
+    )
+
+
+def test_run_in_two_files_counts_once(made_up: pd.DataFrame, tmp_path: Path) -> None:
+    changed = made_up.assign(value=made_up["value"] + 1.0, experiment="table1", code_version="0.2.0")
+    results.write_rows(tmp_path / "a.csv.gz", made_up)
+    results.write_rows(tmp_path / "b.csv.gz", changed)
+    merged = results.read_folder(tmp_path)
+    assert len(merged) == len(made_up) and set(merged["experiment"]) == {"fig-beta"}, "the first file counts, as a whole"
+
+
+def test_runs_on_two_versions_of_a_file_are_two_runs(made_up: pd.DataFrame) -> None:
+    assert len(results.merge([made_up, made_up.assign(dataset_sha256="cd" * 32)])) == 2 * len(made_up)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"value": float("nan")}, "finite"),
+        ({"dataset_sha256": "abc"}, "64 hexadecimal digits"),
+        ({"hyperparameters": "{beta: 2}"}, "JSON object"),
+        ({"seed": -1}, "whole numbers"),
+        ({"step": 500, "metric": "q_data"}, "is there twice"),
+    ],
+)
+def test_rows_that_mean_nothing_are_refused(change: dict[str, object], message: str, made_up: pd.DataFrame) -> None:
+    with pytest.raises(ResultsError, match=message):
+        results.check_rows(made_up.assign(**change), "rows")  # type: ignore[arg-type]
+
+
+def test_run_with_two_sets_of_hyperparameters_is_refused(made_up: pd.DataFrame) -> None:
+    made_up.loc[0, "hyperparameters"] = '{"beta":3}'
+    with pytest.raises(ResultsError, match="two sets of hyperparameters"):
+        results.check_rows(made_up, "rows")
+
+
+@pytest.mark.parametrize("content", [b"not compressed", gzip.compress(b"a,b\n1,2\n"), gzip.compress(b"x" * 1000)[:40], b""])
+def test_damaged_file_is_refused_by_name(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "table1.csv.gz"
+    path.write_bytes(content)
+    with pytest.raises(ResultsError, match=r"table1\.csv\.gz"):
+        results.read_rows(path)
+
+
+def test_folder_of_something_else_is_refused_by_name(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    (folder / "config.yml").write_text("run: {algo: dce}\n")
+    with pytest.raises(CheckpointError, match="not that of a run"):
+        results.rows_of_run(folder, "table1")
