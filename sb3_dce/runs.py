@@ -284,7 +284,7 @@ def _seconds_before(folder: Path) -> float:
             if "time/time_elapsed" not in header:
                 continue
             column = header.index("time/time_elapsed")
-            values = [line.split(",")[column] for line in text if line.count(",") >= column]
+            values = [line.strip().split(",")[column] for line in text if line.count(",") >= column]
         total += max((float(v) for v in values if v), default=0.0)
     return total
 
