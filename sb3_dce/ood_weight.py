@@ -29,7 +29,7 @@ class OODWeight:
     ood_weight_decay: float
     ood_weight_min: float
     steps_per_epoch: int
-    ood_q: th.Tensor | None  # Q(s, a ~ pi) of the last update, on the device
+    ood_q: th.Tensor  # Q(s, a ~ pi) of the last update, on the device; recorded while the weight is adaptive
     recorded_q: list[float]  # one value per epoch, the last 20
     n_ood_weight_decays: int
     _n_updates: int
@@ -50,7 +50,7 @@ class OODWeight:
     def setup_extras(self) -> None:
         """Create the memory of the adaptive weight."""
         super().setup_extras()  # type: ignore[misc]
-        self.ood_q = th.zeros(1, device=self.device) if self.adaptive_ood_weight else None  # type: ignore[attr-defined]
+        self.ood_q = th.zeros(1, device=self.device)  # type: ignore[attr-defined]
         if not hasattr(self, "recorded_q"):  # else a saved model is being loaded
             self.recorded_q, self.n_ood_weight_decays = [], 0
 
@@ -59,7 +59,7 @@ class OODWeight:
         :return: storage of each network, and of further learners, by name
         """
         storages: dict[str, Storage] = super().make_storages()  # type: ignore[misc]
-        if self.ood_q is not None:
+        if self.adaptive_ood_weight:
             storages[OOD_Q] = Storage([self.ood_q])
         return storages
 
@@ -107,7 +107,7 @@ class OODWeight:
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         modules, tensors = super()._get_torch_save_params()  # type: ignore[misc]
-        return modules, [*tensors, OOD_Q] if self.adaptive_ood_weight else tensors
+        return modules, [*tensors, OOD_Q]  # always: the rule may be switched on or off when a saved model is loaded
 
     def _excluded_save_params(self) -> list[str]:
         names: list[Any] = super()._excluded_save_params()  # type: ignore[misc]

@@ -132,9 +132,17 @@ class SavingMixin(OffPolicyAlgorithm):
                 raise CheckpointError(
                     f"parameters do not match this configuration: missing {sorted(expected - got)}, "
                     f"unknown {sorted(got - expected)}",
-                    hint="ent_coef cannot change between 'auto' and a number, nor use_v, when a saved model is loaded.",
+                    hint="What is learned and what is fixed cannot change when a saved model is loaded: ent_coef between 'auto' "
+                    "and a number, lagrange_threshold between None and a number, use_v.",
                 )
-        super().set_parameters(load_path_or_dict, exact_match, device)
+        try:
+            super().set_parameters(load_path_or_dict, exact_match, device)
+        except RuntimeError as error:  # of load_state_dict: its second line names a network, what is wrong and the shapes
+            found = str(error).strip().splitlines()[:2][-1].strip()
+            raise CheckpointError(
+                f"parameters do not match this configuration: {found[:200]}",
+                hint="Networks cannot change their shape or number when a saved model is loaded: leave such arguments out.",
+            ) from error
 
     def get_parameters(self) -> dict[str, dict]:
         """

@@ -27,7 +27,7 @@ from update_tools import (
 )
 
 from sb3_dce import OfflinePBRL, Transitions, ensembles, hyperparams, losses
-from sb3_dce.errors import ConfigError
+from sb3_dce.errors import CheckpointError, ConfigError
 from sb3_dce.population import Population
 
 BATCH, ACTIONS, CRITICS = 8, 3, 4
@@ -40,8 +40,7 @@ def make_model(data: Transitions, **kwargs: Any) -> OfflinePBRL:
     settings |= {"n_critics": CRITICS, "n_ood_actions": ACTIONS, "uncertainty_coef": 0.5, **kwargs}
     model = OfflinePBRL("MlpPolicy", dataset=data, policy_kwargs=policy_kwargs, **settings)
     to_float64(model)
-    if model.ood_q is not None:
-        model.ood_q = model.ood_q.double()
+    model.ood_q = model.ood_q.double()
     _centre(model)
     return model
 
@@ -353,6 +352,24 @@ def test_adaptive_run_goes_on_as_if_never_stopped(hdf5_file: Path, tmp_path: Pat
     assert largest_difference(all_tensors(model), all_tensors(loaded)) == 0.0
     assert loaded.recorded_q == model.recorded_q
     assert loaded.n_ood_weight_decays == model.n_ood_weight_decays > 0
+
+
+@pytest.mark.parametrize("saved", [True, False])
+def test_adaptive_weight_can_be_switched_at_load(saved: bool, hdf5_file: Path, tmp_path: Path) -> None:
+    small = {"batch_size": BATCH, "n_critics": 2, "n_ood_actions": 1, "policy_kwargs": {"net_arch": [8]}}
+    OfflinePBRL("MlpPolicy", dataset=hdf5_file, seed=0, adaptive_ood_weight=saved, **small).learn(2).save(tmp_path / "model")
+    loaded = OfflinePBRL.load(tmp_path / "model", adaptive_ood_weight=not saved, steps_per_epoch=1)
+    assert len(loaded.recorded_q) == (1 if saved else 0)
+    loaded.learn(3, reset_num_timesteps=False)
+    assert len(loaded.recorded_q) == (1 if saved else 3)
+
+
+@pytest.mark.parametrize("arguments", [{"prior_scale": 1.0}, {"n_critics": 3}], ids=str)
+def test_networks_of_a_saved_model_cannot_change(arguments: dict[str, Any], hdf5_file: Path, tmp_path: Path) -> None:
+    small = {"batch_size": BATCH, "n_critics": 2, "n_ood_actions": 1, "policy_kwargs": {"net_arch": [8]}}
+    OfflinePBRL("MlpPolicy", dataset=hdf5_file, seed=0, **small).save(tmp_path / "model")
+    with pytest.raises(CheckpointError, match=r"parameters do not match this configuration.*critic"):
+        OfflinePBRL.load(tmp_path / "model", **arguments)
 
 
 def test_members_of_a_population_adapt_like_single_runs(transitions: Transitions) -> None:
