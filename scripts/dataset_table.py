@@ -127,7 +127,8 @@ def page(folder: Path, machine: str) -> str:
         *(content_row(dataset_id, folder) for dataset_id in made),
         "",
         "Returns are mean ± standard deviation over whole episodes. Seconds are wall time, other work running beside; steps "
-        "per processor second include loading, compressing and writing. Joined and copied sets record no steps.",
+        "per processor second include loading, compressing and writing; `benchmarks/results/recording.md` has those of the "
+        "present recorder by itself. Joined and copied sets record no steps.",
         "",
         "## Where they come from",
         "",
