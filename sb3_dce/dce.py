@@ -22,7 +22,7 @@ from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import OfflineSACPolicy
 from sb3_dce.schedules import StepSchedule
 from sb3_dce.state import PureNet, Storage
-from sb3_dce.steps import descend, polyak, q_data_metrics
+from sb3_dce.steps import Forward, descend, descend_from, polyak, q_data_metrics
 from sb3_dce.theory import beta_eff, shift_factor
 
 PENALTY_SOURCES = ("policy", "policy_deterministic", "next_policy", "dataset", "uniform")
@@ -394,7 +394,8 @@ def update(
     lr, clip = coef["learning_rate"], options.max_grad_norm
     new: dict[str, Any] = {}
 
-    mean, log_std, _ = nets["actor"](state["actor"].params, s)
+    actor = Forward.of(lambda params: nets["actor"](params, s)[:2], state["actor"].params)
+    mean, log_std = actor.outputs
     a_pi, _ = losses.squashed_gaussian(mean, log_std, noise["actor"])
     a_pen = _penalty_actions(options, nets, state, batch, noise, (mean, log_std), a_pi)
 
@@ -446,13 +447,12 @@ def update(
         return new, metrics
     ent_coef = state[ENT_COEF].params.exp() if options.learned_ent_coef else coef["ent_coef"]
 
-    def pi_loss(params: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        mean, log_std, _ = nets["actor"](params, s)
-        actions, log_prob = losses.squashed_gaussian(mean, log_std, noise["actor"])
+    def pi_loss(outputs: tuple[th.Tensor, ...]) -> tuple[th.Tensor, th.Tensor]:
+        actions, log_prob = losses.squashed_gaussian(*outputs, noise["actor"])
         q_pi = losses.reduce_critics(nets["critic"](new["critic"].params, s, actions), options.actor_q)
         return losses.sac_actor_loss(log_prob, q_pi, ent_coef), log_prob
 
-    new["actor"], loss, log_prob, norm = descend(pi_loss, state["actor"], lr, settings["actor"], clip)
+    new["actor"], loss, log_prob, norm = descend_from(actor, pi_loss, state["actor"], lr, settings["actor"], clip)
     metrics.update(actor_loss=loss, grad_norm_actor=norm, entropy=-log_prob.mean(), ent_coef=ent_coef.mean())
     if options.learned_ent_coef:
         new[ENT_COEF], metrics["ent_coef_loss"] = descend_ent_coef(

@@ -8,9 +8,10 @@ optimizers, moving averages and the write-back) into one compiled graph; it pays
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import torch as th
@@ -168,6 +169,7 @@ class Engine(Generic[S]):
         self._update = update
         self._compiled: dict[Variant, Step] = {}
         self._captured: dict[Variant, CapturedStep] = {}
+        self._guarded_for: set[tuple[Variant, tuple[th.Size, ...]]] = set()
 
     def step(self, batch: Any, noise: dict[str, th.Tensor], coef: dict[str, th.Tensor], **variant: Any) -> None:
         """
@@ -183,9 +185,24 @@ class Engine(Generic[S]):
             if self.execution == "eager":
                 self.metrics.add(self._in_place(variant)(self.state.read(), batch, noise, coef))
             elif self.execution == "compile":
-                self.metrics.add(self._compiled_step(key)(self.state.read(), batch, noise, coef))
+                with self._guards_evaluated_once(key, batch):
+                    self.metrics.add(self._compiled_step(key)(self.state.read(), batch, noise, coef))
             else:
                 self._captured_step(key, batch, noise, coef).replay(batch, noise)
+
+    @contextlib.contextmanager
+    def _guards_evaluated_once(self, key: Variant, batch: Any) -> Iterator[None]:
+        """
+        PyTorch asks at each call whether the graph still fits its arguments, which takes as long as a matrix product of the
+        update. Of what it asks, only the number of rows can change from one call to the next; while it stays, once is enough.
+        """
+        sizes = tuple(leaf.shape for leaf in tree_leaves(batch) if isinstance(leaf, th.Tensor))
+        if (key, sizes) in self._guarded_for:
+            with th.compiler.set_stance(skip_guard_eval_unsafe=True):
+                yield
+        else:
+            yield
+            self._guarded_for.add((key, sizes))
 
     def _compiled_step(self, key: Variant) -> Step:
         if key not in self._compiled:

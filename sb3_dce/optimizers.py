@@ -92,7 +92,9 @@ def adam_step(learner: Learner, gradient: th.Tensor, learning_rate: th.Tensor, s
     exp_avg_sq = settings.beta2 * learner.exp_avg_sq + (1.0 - settings.beta2) * gradient.square()
     # In float64 whatever the parameters' dtype: 1 - beta2^step loses half its digits in float32 at the start.
     exact_step = step.double()
-    step_size = (learning_rate / (1.0 - settings.beta1**exact_step)).to(params.dtype)
-    root_correction = (1.0 - settings.beta2**exact_step).sqrt().to(params.dtype)
+    step_size = learning_rate / (1.0 - settings.beta1**exact_step)
+    root_correction = (1.0 - settings.beta2**exact_step).sqrt()
+    # Stacked, since a stack is computed once: the compiler would otherwise take both powers again for every few parameters.
+    step_size, root_correction = th.stack([step_size, root_correction]).to(params.dtype).unbind()
     params = params - step_size * exp_avg / (exp_avg_sq.sqrt() / root_correction + settings.eps)
     return Learner(params, exp_avg, exp_avg_sq, step)

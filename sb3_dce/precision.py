@@ -1,5 +1,8 @@
 """
 Cheaper matrix products for the time of training. The switches of PyTorch are process-wide, so they are put back.
+
+``bf16-matmul`` has two forms. Processors with AMX round the factors themselves (the switch of PyTorch). Those that only have
+AVX-512 bf16 ignore that switch, so the layers are given rounded factors by hand, which doubles the speed of their products.
 """
 
 from __future__ import annotations
@@ -11,10 +14,32 @@ from collections.abc import Iterator
 from typing import Any
 
 import torch as th
+from torch.nn import functional as F
+from torch.overrides import TorchFunctionMode
 
 from sb3_dce.errors import SB3DCEWarning
 
 PRECISIONS = ("float32", "bf16-matmul", "tf32")
+
+# Layers narrower than this on either side stay float32: they take little time, and observations, actions and values keep
+# their digits.
+MIN_ROUNDED_WIDTH = 32
+
+
+class RoundedLinear(TorchFunctionMode):
+    """
+    While active, wide linear layers round weights, inputs and products, and on the way back gradients, to bf16.
+
+    Sums inside a product, biases and everything between the layers stay float32. Being seen by whoever traces or transforms
+    an update, it holds in every way of running it.
+    """
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func is F.linear and args[0].dtype == th.float32 and min(args[1].shape) >= MIN_ROUNDED_WIDTH:
+            inputs, weight, bias = (*args, *(kwargs or {}).values(), None)[:3]
+            product = F.linear(inputs.bfloat16(), weight.bfloat16()).float()
+            return product if bias is None else product + bias
+        return func(*args, **(kwargs or {}))
 
 
 @contextlib.contextmanager
@@ -34,6 +59,10 @@ def matmul_precision(precision: str, device: th.device) -> Iterator[None]:
         _warn_once(f"precision={precision!r} needs {reason}: computing in float32.")
         yield
         return
+    if precision == "bf16-matmul" and not _rounds_itself():
+        with RoundedLinear():
+            yield
+        return
     switch: Any = th.backends.cuda.matmul if precision == "tf32" else th.backends.mkldnn.matmul  # type: ignore[attr-defined]
     before = switch.fp32_precision
     switch.fp32_precision = precision.partition("-")[0]
@@ -49,9 +78,19 @@ def _missing(precision: str, device: th.device) -> str | None:
         if device.type == "cuda" and th.cuda.get_device_capability(device) >= (8, 0):
             return None
         return f"a CUDA device of compute capability 8.0 or more, the model is on {device}"
-    if device.type == "cpu" and th.ops.mkldnn._is_mkldnn_bf16_supported():
+    if device.type == "cpu" and (_rounds_itself() or _processor_has("avx512_bf16")):
         return None
     return f"a processor with AVX-512 or AMX bf16, the model is on {device}"
+
+
+def _rounds_itself() -> bool:
+    """Whether the processor multiplies float32 matrices as bf16 when PyTorch's switch asks for it."""
+    return _processor_has("amx_bf16")
+
+
+def _processor_has(feature: str) -> bool:
+    # absent before PyTorch 2.9 and in builds without detection: then nothing is claimed
+    return bool(getattr(th.cpu, "get_capabilities", dict)().get(feature, False))
 
 
 @functools.cache
