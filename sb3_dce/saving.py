@@ -132,8 +132,8 @@ class SavingMixin(OffPolicyAlgorithm):
                 raise CheckpointError(
                     f"parameters do not match this configuration: missing {sorted(expected - got)}, "
                     f"unknown {sorted(got - expected)}",
-                    hint="What is learned and what is fixed cannot change when a saved model is loaded: ent_coef between 'auto' "
-                    "and a number, lagrange_threshold between None and a number, use_v.",
+                    hint="What is learned cannot become fixed, or the other way round, when a saved model is loaded: ent_coef "
+                    "(a number or 'auto'), lagrange_threshold (None or a number), use_v.",
                 )
         try:
             super().set_parameters(load_path_or_dict, exact_match, device)
