@@ -18,7 +18,7 @@ from update_tools import all_tensors, largest_difference
 from sb3_dce import OfflineDCE
 from sb3_dce.errors import ConfigError, DivergenceError
 from sb3_dce.population_runs import STATE_FILE, BatchedRuns, train_population
-from sb3_dce.runs import RunSpec
+from sb3_dce.runs import RunSpec, run
 
 TINY = "halfcheetah-tiny-sb3"
 QUICK = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 16}
@@ -49,7 +49,8 @@ def test_runs_write_what_single_runs_write(tmp_path: Path) -> None:
 
 
 def test_own_randomness_makes_the_members_of_single_runs(tmp_path: Path) -> None:
-    train_population(specs(tmp_path / "alone", execution="eager"), device="cpu", workers=2)
+    for spec in specs(tmp_path / "alone", execution="eager"):
+        run(spec)
     runs = BatchedRuns(specs(tmp_path / "together"), CPU, "eager", Console(quiet=True), own_randomness=True)
     runs.run()
     for seed in range(2):
