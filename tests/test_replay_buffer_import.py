@@ -10,11 +10,20 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.save_util import save_to_pkl
 
 from sb3_dce.buffers import OfflineReplayBuffer
-from sb3_dce.data import Transitions, load_transitions
+from sb3_dce.data import Transitions, load_dataset, load_transitions
 from sb3_dce.data.sb3_buffer import arrays_from_replay_buffer
-from sb3_dce.errors import DatasetFormatError, DatasetSecurityError, DatasetSemanticsError, DatasetWarning
+from sb3_dce.errors import (
+    ConfigError,
+    DatasetFormatError,
+    DatasetIntegrityError,
+    DatasetNotFoundError,
+    DatasetSecurityError,
+    DatasetSemanticsError,
+    DatasetWarning,
+)
 
 OBSERVATIONS = spaces.Box(-np.inf, np.inf, (3,), np.float32)
 UNIT = spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -170,5 +179,28 @@ def test_saved_buffer_is_never_unpickled(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(pickle, "load", refuse)
     for read in (Transitions.from_replay_buffer, load_transitions):
         for given in (path, str(path)):
-            with pytest.raises(DatasetSecurityError, match=r"pickle runs code.*load_replay_buffer\(path\) yourself"):
+            with pytest.raises(DatasetSecurityError, match=r"pickle runs code.*pass trust='pickle'"):
                 read(given)
+
+
+@pytest.mark.parametrize("read", [Transitions.from_replay_buffer, load_transitions, load_dataset])
+def test_saved_buffer_that_is_trusted_gives_the_rows_of_the_buffer(read: Any, tmp_path: Path) -> None:
+    buffer = ReplayBuffer(80, OBSERVATIONS, WIDE, device="cpu", n_envs=2)
+    fill(buffer, 95, WIDE)
+    save_to_pkl(tmp_path / "replay_buffer.pkl", buffer)
+    got, expected = read(tmp_path / "replay_buffer.pkl", trust="pickle"), Transitions.from_replay_buffer(buffer)
+    assert len(got) == 80 and np.array_equal(got.rows, expected.rows) and np.array_equal(got.timeouts, expected.timeouts)
+
+
+def test_trusted_file_that_is_no_buffer_is_an_error_in_words(tmp_path: Path) -> None:
+    path = tmp_path / "replay_buffer.pkl"
+    with pytest.raises(DatasetNotFoundError):
+        Transitions.from_replay_buffer(path, trust="pickle")
+    path.write_bytes(b"no pickle")
+    with pytest.raises(DatasetIntegrityError, match="cannot be opened as a saved replay buffer"):
+        Transitions.from_replay_buffer(path, trust="pickle")
+    path.write_bytes(pickle.dumps([1]))
+    with pytest.raises(DatasetFormatError, match="list is no replay buffer"):
+        Transitions.from_replay_buffer(path, trust="pickle")
+    with pytest.raises(ConfigError, match="trust must be 'safe' or 'pickle', got 'weights'"):
+        Transitions.from_replay_buffer(path, trust="weights")  # type: ignore[arg-type]

@@ -18,7 +18,7 @@ _READERS: dict[str, Callable[..., Transitions]] = {
     ".npz": Transitions.from_npz,
     ".csv": Transitions.from_csv,
     ".parquet": Transitions.from_parquet,
-    ".pkl": Transitions.from_replay_buffer,  # which refuses it
+    ".pkl": Transitions.from_replay_buffer,  # which refuses it without trust="pickle"
 }
 
 

@@ -7,11 +7,12 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from os import PathLike
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
-from sb3_dce.errors import DatasetFormatError, DatasetSecurityError, DatasetWarning
+from sb3_dce.data.locate import require_file
+from sb3_dce.errors import ConfigError, DatasetFormatError, DatasetIntegrityError, DatasetSecurityError, DatasetWarning
 
 _NEEDED = ("observations", "actions", "rewards", "dones", "timeouts", "pos", "full", "n_envs", "action_space")
 
@@ -26,16 +27,8 @@ def arrays_from_replay_buffer(buffer: Any) -> dict[str, np.ndarray]:
         [-1, 1] as all off-policy algorithms store them. With ``optimize_memory_usage=True`` it has no next observations, so
         the last row of each environment, whose next observation is unknown, will be dropped.
     :return: key to array
-    :raises DatasetSecurityError: if a path is given
     :raises DatasetFormatError: if it is no such buffer, or its observations or actions are not vectors of numbers
     """
-    if isinstance(buffer, (str, PathLike)):
-        raise DatasetSecurityError(
-            "a saved replay buffer is a pickle, and opening a pickle runs code, so this is not done here",
-            where=str(buffer),
-            hint="If you trust it, call model.load_replay_buffer(path) yourself and pass model.replay_buffer",
-            path=buffer,
-        )
     low, high = _bounds(buffer)
     order, n_envs = _oldest_first(buffer), int(buffer.n_envs)
     has_next = not getattr(buffer, "optimize_memory_usage", False)
@@ -64,6 +57,41 @@ def arrays_from_replay_buffer(buffer: Any) -> dict[str, np.ndarray]:
         "timeouts": timeouts,
     }
     return arrays | ({"next_observations": per_env(buffer.next_observations)} if has_next else {})
+
+
+def load_saved_buffer(path: str | PathLike[str], trust: str) -> Any:
+    """
+    The buffer that ``model.save_replay_buffer`` has written.
+
+    :param path: file, a pickle
+    :param trust: ``"pickle"`` opens it, which may run any code; ``"safe"`` does not
+    :return: what is in it
+    :raises DatasetSecurityError: without ``trust="pickle"``
+    :raises ConfigError: for another word
+    :raises DatasetNotFoundError: if there is no such file
+    :raises DatasetIntegrityError: if it cannot be read
+    """
+    if trust not in ("safe", "pickle"):
+        raise ConfigError(f"trust must be 'safe' or 'pickle', got {trust!r}", key="trust", hint="Leave it out")
+    if trust == "safe":
+        raise DatasetSecurityError(
+            "a saved replay buffer is a pickle, and opening a pickle runs code, so this is not done unasked",
+            where=str(path),
+            hint="If you trust it, pass trust='pickle', or the buffer itself: model.replay_buffer",
+            path=path,
+        )
+    with require_file(path).open("rb") as stream:
+        return _unpickled(stream, str(path))
+
+
+def _unpickled(stream: BinaryIO, where: str) -> Any:
+    import pickle  # nowhere else in this package's reading of data
+
+    try:
+        return pickle.load(stream)
+    except Exception as exc:  # whatever the code in it raises
+        what = f"cannot be opened as a saved replay buffer ({type(exc).__name__}: {exc})"
+        raise DatasetIntegrityError(what, where=where, hint="Save the buffer again", path=where) from exc
 
 
 def _bounds(buffer: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from sb3_dce.data.minari_episodes import open_episodes
 from sb3_dce.data.npz import arrays_from_npz, npz_keys, write_npz
 from sb3_dce.data.records import BOUNDS_ATTRIBUTE, DatasetInfo, ReadOptions, bounds_attribute
 from sb3_dce.data.row_cache import cached_rows
-from sb3_dce.data.sb3_buffer import arrays_from_replay_buffer
+from sb3_dce.data.sb3_buffer import arrays_from_replay_buffer, load_saved_buffer
 from sb3_dce.data.tables import Columns, arrays_from_csv, arrays_from_dataframe, arrays_from_parquet
 from sb3_dce.errors import DatasetError, DatasetSemanticsError, DatasetWarning
 
@@ -219,16 +219,20 @@ class Transitions:
         return cls.from_arrays(**arrays, **options)
 
     @classmethod
-    def from_replay_buffer(cls, buffer: Any, **options: Any) -> Transitions:
+    def from_replay_buffer(cls, buffer: Any, *, trust: Literal["safe", "pickle"] = "safe", **options: Any) -> Transitions:
         """
         Take a replay buffer of Stable-Baselines3 that an off-policy algorithm has filled, in the units of the environment.
 
-        :param buffer: ``model.replay_buffer``; several environments, a full ring and ``optimize_memory_usage`` are all right
+        :param buffer: ``model.replay_buffer``; several environments, a full ring and ``optimize_memory_usage`` are all right.
+            Or the file that ``model.save_replay_buffer`` has written, with ``trust="pickle"``.
+        :param trust: ``"safe"`` opens no saved buffer, since such a file is a pickle and may run any code; ``"pickle"`` does
         :param options: options of :meth:`from_arrays`; the bounds of the actions are those of the buffer's action space
         :return: the dataset
-        :raises DatasetSecurityError: for the path of a saved buffer, which is a pickle
+        :raises DatasetSecurityError: for the path of a saved buffer without ``trust="pickle"``
         :raises DatasetError: if it is no such buffer, or its numbers make no sense
         """
+        if isinstance(buffer, str | PathLike):
+            buffer = load_saved_buffer(buffer, trust)
         arrays: dict[str, Any] = arrays_from_replay_buffer(buffer)
         space = buffer.action_space
         bounds = {"action_low": np.ravel(space.low), "action_high": np.ravel(space.high)}
