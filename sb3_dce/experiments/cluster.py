@@ -8,6 +8,7 @@ here is never run again.
 
 from __future__ import annotations
 
+import socket
 import traceback
 from collections.abc import Sequence
 from dataclasses import replace
@@ -59,8 +60,9 @@ def run_on_cluster(specs: Sequence[RunSpec], address: str, console: Console) -> 
     begun_here = not ray.is_initialized()
     if begun_here:
         try:
+            _knock(address)
             ray.init(address=address, log_to_driver=False, configure_logging=False)
-        except (ConnectionError, ValueError, RuntimeError) as error:
+        except (OSError, ValueError, RuntimeError) as error:
             raise ConfigError(
                 f"no Ray cluster at {address}: {str(error).splitlines()[0]}",
                 key="--ray-address",
@@ -71,6 +73,13 @@ def run_on_cluster(specs: Sequence[RunSpec], address: str, console: Console) -> 
     finally:
         if begun_here:
             ray.shutdown()
+
+
+def _knock(address: str) -> None:
+    """Ray itself waits for minutes for a machine that does not answer."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if host and port.isdigit():
+        socket.create_connection((host, int(port)), timeout=10).close()
 
 
 def _collect(ray: Any, specs: Sequence[RunSpec], console: Console) -> list[BaseException]:

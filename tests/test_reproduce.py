@@ -1,0 +1,287 @@
+"""``sb3-dce reproduce``: runs of a grid, kills and resumes, rows that count as done, other machines, the probe."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch as th
+from commands import sb3_dce
+from rich.console import Console
+from update_tools import all_tensors, largest_difference
+
+from sb3_dce import OfflineDCE
+from sb3_dce.data import write_hdf5
+from sb3_dce.data.locate import DATASETS_VARIABLE
+from sb3_dce.dce_probe import PROBE_BETAS, OfflineDCEProbe
+from sb3_dce.errors import ConfigError, DivergenceError
+from sb3_dce.experiments import results
+from sb3_dce.experiments.grid import PlannedRun, Scale, expand, load_experiment
+from sb3_dce.experiments.probe import prepare_probe
+from sb3_dce.experiments.reproduce import Request, reproduce
+from sb3_dce.experiments.run import execute, is_complete, populations
+from sb3_dce.runs import RunSpec, read_divergence, run
+
+TINY = "halfcheetah-tiny-sb3"
+QUIET = Console(quiet=True)
+QUICK = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 16}
+
+
+def small_plan(name: str, folder: Path, updates: int = 40, seeds: int = 1) -> list[PlannedRun]:
+    experiment = load_experiment(name)
+    scale = Scale("embedded", updates, updates // 2, 1, seeds, QUICK)
+    return expand(experiment, scale, folder / "runs")
+
+
+def train(planned: list[PlannedRun], done: set[tuple[object, ...]] = frozenset(), **settings: object) -> list[str]:  # type: ignore[assignment]
+    arguments = {"workers": 2, "device": "cpu", "ray_address": None, "console": QUIET, **settings}
+    return execute(planned, done, **arguments)  # type: ignore[arg-type]
+
+
+def models(folder: Path) -> dict[str, int]:
+    return {path.parent.name: path.stat().st_mtime_ns for path in folder.glob("runs/*/model.zip")}
+
+
+def test_one_command_trains_reports_and_goes_on(tmp_path: Path) -> None:
+    arguments = ("--updates", "20", "--out", str(tmp_path), "--workers", "2")
+    first = sb3_dce("reproduce", "fig-cql-return", *arguments)
+    assert first.code == 0, first.stderr
+    assert "2 runs of 20 gradient steps, 0 of them complete" in first.stdout
+    assert "smoke scale: tiny data" in first.stdout and "net_arch" in first.stdout
+    assert (tmp_path / "figures" / "fig-cql-return.png").stat().st_size > 10_000
+    rows = results.read_folder(tmp_path / "rows")
+    assert len(results.done_keys(rows)) == 2 and set(rows["dataset"]) == {TINY}
+    made = models(tmp_path)
+    again = sb3_dce("reproduce", "fig-cql-return", *arguments)
+    assert "2 of them complete" in again.stdout and models(tmp_path) == made, "nothing is trained again"
+    pd.testing.assert_frame_equal(results.read_folder(tmp_path / "rows"), rows)
+
+
+def test_runs_known_as_rows_are_neither_trained_nor_counted_twice(tmp_path: Path) -> None:
+    for planned in small_plan("fig-cql-return", tmp_path / "one", updates=4):
+        run(planned.spec)
+    known = results.planned_rows(small_plan("fig-cql-return", tmp_path / "one", updates=4))
+    results.write_rows(tmp_path / "kept" / "part.csv.gz", known)
+    # both agents are among those of other figures too
+    plan = [r for name in ("fig-cql-return", "fig-cql-q") for r in small_plan(name, tmp_path / "two", updates=4)]
+    done = results.done_keys(results.read_folder(tmp_path / "kept"))
+    wanted = [r for r in plan if r.key not in done]
+    assert len(plan) == 8 and {r.variant for r in plan} - {r.variant for r in wanted} == {"DCE", "Eq. 18"}
+    assert train([r for r in plan if r.key in done], done) == [] and not (tmp_path / "two").exists()
+    run(wanted[0].spec)
+    new = results.planned_rows(plan)
+    assert len(results.done_keys(results.merge([known, new]))) == 3
+
+
+def test_run_that_diverges_stops_no_other_and_is_not_begun_again(tmp_path: Path) -> None:
+    dce, eq18 = small_plan("fig-cql-return", tmp_path)
+    wild = replace(dce, spec=replace(dce.spec, overrides={**dce.spec.overrides, "learning_rate": 1e30}))
+    (text,) = train([wild, eq18])
+    assert "diverged between updates 0 and" in text
+    assert is_complete(wild.spec) and is_complete(eq18.spec) and read_divergence(Path(wild.spec.folder)) is not None
+    assert train([wild, eq18]) == []
+    rows = results.planned_rows([wild, eq18])
+    assert set(rows[rows["metric"] == "diverged"]["agent"]) == {"dce"}
+
+
+def test_error_of_a_run_is_said_after_the_others_have_been_run(tmp_path: Path) -> None:
+    dce, eq18 = small_plan("fig-cql-return", tmp_path)
+    wrong = replace(dce, spec=replace(dce.spec, overrides={**dce.spec.overrides, "beta": -1.0}))
+    with pytest.raises(ConfigError, match="beta must be"):
+        train([wrong, eq18], workers=1)
+    assert is_complete(eq18.spec) and not is_complete(wrong.spec)
+
+
+def test_runs_that_can_be_batched_are_one_population(tmp_path: Path) -> None:
+    plan = small_plan("fig-beta", tmp_path, seeds=2)
+    groups = populations(run.spec for run in plan)
+    # all DCE runs differ in numbers and seeds alone
+    assert sorted((group[0].algo, len(group)) for group in groups) == [("dce", 14), ("offline_bc", 2), ("offline_sac", 2)]
+    mixed = populations(run.spec for run in small_plan("fig-cql-q", tmp_path))
+    assert sorted(len(group) for group in mixed) == [1, 1, 4], "another source of the penalty's actions is another update"
+
+
+# -- the probe -----------------------------------------------------------------------------------------------------
+
+
+def test_probe_is_sac_with_v_and_its_critics_differ_in_beta_alone() -> None:
+    settings = {"seed": 0, "device": "cpu", "execution": "eager", **QUICK}
+    probe = OfflineDCEProbe.load_dataset(TINY, **settings).learn(30, log_interval=None)
+    plain = OfflineDCE.load_dataset(TINY, beta=0.0, beta_final=None, beta_rate=0.0, ent_coef=1.0, **settings)
+    plain.learn(30, log_interval=None)
+    assert all(th.equal(a, b) for a, b in zip(probe.actor.parameters(), plain.actor.parameters(), strict=True))
+    assert all(th.equal(a, b) for a, b in zip(probe.critic.parameters(), plain.critic.parameters(), strict=True))
+    metrics = probe.read_metrics()
+    falling = [metrics[f"probe{beta}_data"] for beta in (0, *PROBE_BETAS)]
+    assert falling == sorted(falling, reverse=True) and metrics["probe0_data"] == pytest.approx(metrics["q_data"])
+    assert metrics["probe4_min"] <= metrics["probe4_max"]
+
+
+def test_probe_critics_equal_those_of_a_dce_run_while_the_actor_stands_still() -> None:
+    settings = {"seed": 0, "device": "cpu", "execution": "eager", **QUICK}
+    probe = OfflineDCEProbe.load_dataset(TINY, **settings).learn(1, log_interval=None)
+    alone = OfflineDCE.load_dataset(TINY, beta=8.0, beta_final=None, beta_rate=0.0, ent_coef=1.0, **settings)
+    alone.learn(1, log_interval=None)  # both have seen the actor of the start only
+    theirs = [p for p in probe.policy.critic_beta8.parameters()]
+    assert all(th.equal(a, b) for a, b in zip(theirs, alone.critic.parameters(), strict=True))
+
+
+def test_probe_starts_with_the_best_policy_and_keeps_it(tmp_path: Path) -> None:
+    dce, probe = small_plan("fig-ood", tmp_path)
+    with pytest.raises(ConfigError, match="needs the last policy of the DCE run"):
+        prepare_probe(probe.spec, Path(dce.spec.folder))
+    train([dce, probe])
+    trained, measured = (
+        agent.load(Path(r.spec.folder) / "model.zip") for agent, r in ((OfflineDCE, dce), (OfflineDCEProbe, probe))
+    )
+    best, start = measured.actor_best, measured.policy.actor_init
+    assert all(th.equal(a, b) for a, b in zip(best.parameters(), trained.actor.parameters(), strict=True))
+    assert not all(th.equal(a, b) for a, b in zip(start.parameters(), trained.actor.parameters(), strict=True))
+    rows = results.planned_rows([probe])
+    assert {f"probe{beta}_max" for beta in (0, *PROBE_BETAS)} <= set(rows["metric"])
+
+
+# -- Kitchen -------------------------------------------------------------------------------------------------------
+
+
+def kitchen_file(folder: Path, name: str) -> None:
+    """A small file in the layout of D4RL's Kitchen sets: 60 observations, 9 actions, rewards that count finished tasks."""
+    rng = np.random.default_rng(0)
+    n = 300
+    timeouts = np.zeros(n, dtype=bool)
+    timeouts[99::100] = True
+    arrays = {
+        "observations": rng.standard_normal((n, 60)).astype(np.float32),
+        "actions": rng.uniform(-1.0, 1.0, (n, 9)).astype(np.float32),
+        "rewards": rng.integers(0, 5, n).astype(np.float32),
+        "terminals": np.zeros(n, dtype=bool),
+        "timeouts": timeouts,
+    }
+    write_hdf5(folder / f"{name}.hdf5", arrays)
+
+
+def test_kitchen_row_is_run_where_its_file_is_and_no_data_elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("gymnasium_robotics")
+    monkeypatch.setenv(DATASETS_VARIABLE, str(tmp_path / "data"))
+    monkeypatch.chdir(tmp_path)  # MuJoCo may write a log
+    (tmp_path / "data").mkdir()
+    kitchen_file(tmp_path / "data", "mini_kitchen_microwave_kettle_light_slider-v0")
+    experiment = load_experiment("table-adroit-kitchen")
+    small = replace(experiment.scales["full"], updates=10, eval_freq=10, episodes=1, seeds=1)
+    planned = [r for r in expand(experiment, small, tmp_path / "runs", ["kitchen-complete"]) if r.variant in ("BC", "DCE")]
+    assert {run.spec.dataset for run in planned} == {"kitchen-complete-v0"}
+    for each in planned:
+        run(each.spec)
+    rows = results.planned_rows(planned)
+    assert set(rows[rows["metric"] == "score"]["agent"]) == {"offline_bc", "dce"}
+    results.write_rows(tmp_path / "out" / "rows" / "table.csv.gz", rows)
+    request = Request(("table-adroit-kitchen",), "full", tmp_path / "out", report_only=True)
+    table = reproduce(request, QUIET)["table-adroit-kitchen"].tables["scores"]
+    cells = {row[0]: row for row in table.rows}
+    assert cells["kitchen-complete-v0"][table.header.index("ours: DCE")] not in ("", "-")
+    assert cells["kitchen-complete-v0"][table.header.index("paper: IQL")] == "**62.5**"
+    assert {"kitchen-partial-v0: no data", "kitchen-mixed-v0: no data"} <= set(cells)
+    assert "`kitchen-complete-v0` (D4RL; sha256" in table.caption
+
+
+# -- kills and other machines --------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_killed_command_goes_on_and_counts_nothing_twice(tmp_path: Path) -> None:
+    # as many updates between two evaluations as make a kill in the middle of a run likely
+    command = [sys.executable, "-c", "from sb3_dce.cli import main; main()"]
+    command += ["reproduce", "fig-cql-return", "--scale", "smoke", "--updates", "400", "--workers", "2"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+
+    def start(name: str) -> subprocess.Popen[bytes]:
+        arguments = [*command, "--out", str(tmp_path / name)]
+        return subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment)
+
+    killed = start("killed")
+    deadline = time.monotonic() + 200
+    while len(list(tmp_path.glob("killed/runs/*/checkpoint.zip"))) < 2 and time.monotonic() < deadline:
+        assert killed.poll() is None, killed.communicate()[1]
+        time.sleep(0.02)
+    os.kill(killed.pid, signal.SIGKILL)  # the command alone: its workers have to notice
+    killed.wait()
+    begun = {path.name for path in (tmp_path / "killed" / "runs").iterdir()}
+    assert begun and not list(tmp_path.glob("killed/rows/*"))
+    for name in ("killed", "whole"):
+        process = start(name)
+        assert process.wait(timeout=280) == 0, process.communicate()[1]
+    rows = {name: results.read_folder(tmp_path / name / "rows") for name in ("killed", "whole")}
+    learned = [frame[~frame["metric"].isin(["seconds"])].reset_index(drop=True) for frame in rows.values()]
+    counted = [frame[frame["metric"].isin(["score", "return"])].reset_index(drop=True) for frame in learned]
+    pd.testing.assert_frame_equal(*counted)
+    for folder in begun:
+        one, other = (
+            OfflineDCE.load(tmp_path / name / "runs" / folder / "model.zip") if "cql" not in folder else None for name in rows
+        )
+        if one is not None and other is not None:
+            assert largest_difference(all_tensors(one), all_tensors(other)) == 0.0
+
+
+@pytest.mark.slow
+def test_two_nodes_of_a_ray_cluster_train_what_one_machine_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ray = pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    monkeypatch.setenv("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    cluster = Cluster()
+    try:
+        for node in ("first", "second"):
+            cluster.add_node(num_cpus=1, env_vars={"SB3_DCE_NODE": node, "XDG_CACHE_HOME": str(tmp_path / "cache")})
+        cluster.wait_for_nodes()
+        plan = small_plan("fig-cql-return", tmp_path / "cluster", updates=200, seeds=2)
+        assert train(plan, ray_address=cluster.address) == []
+        nodes = {path.parent.name for path in (tmp_path / "cache" / "sb3_dce" / "cluster").glob("*/*")}
+        assert nodes == {"first", "second"}
+        # a run that diverges there is a result here
+        wild = replace(
+            plan[0], spec=replace(plan[0].spec, folder=str(tmp_path / "wild"), overrides={**QUICK, "learning_rate": 1e30})
+        )
+        (text,) = train([wild], ray_address=cluster.address)
+        assert "diverged" in text and is_complete(wild.spec)
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+    here = small_plan("fig-cql-return", tmp_path / "here", updates=200, seeds=2)
+    train(here)
+    scores = [results.planned_rows(runs).query("metric == 'score'").reset_index(drop=True) for runs in (plan, here)]
+    pd.testing.assert_frame_equal(*scores)
+    stamp = models(tmp_path / "cluster")
+    assert train(plan, ray_address="auto") == [] and models(tmp_path / "cluster") == stamp, "complete: no cluster is asked for"
+
+
+def test_cluster_that_is_not_there_is_said_in_one_sentence(tmp_path: Path) -> None:
+    pytest.importorskip("ray")
+    with pytest.raises(ConfigError, match=r"no Ray cluster at 127\.0\.0\.1:1"):
+        train(small_plan("fig-cql-return", tmp_path), ray_address="127.0.0.1:1")
+
+
+def test_files_from_a_node_are_written_inside_the_run_only(tmp_path: Path) -> None:
+    from sb3_dce.experiments.cluster import receive
+
+    receive(tmp_path / "run", {"result.json": b"{}", "../outside": b"x", "model.zip": b"y"})
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {"result.json", "model.zip"}
+    assert not (tmp_path / "outside").exists()
+
+
+def test_divergence_is_written_where_the_run_is(tmp_path: Path) -> None:
+    from sb3_dce.launch import train_one
+
+    spec = RunSpec("dce", TINY, 0, 30, str(tmp_path / "run"), 10, 1, {**QUICK, "learning_rate": 1e30})
+    with pytest.raises(DivergenceError):
+        train_one(spec, lambda progress: None)
+    found = read_divergence(tmp_path / "run")
+    assert found is not None and found["n_updates"] <= 30 and "not finite" in found["reason"]
