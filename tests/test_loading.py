@@ -141,7 +141,7 @@ def test_bounds_of_the_actions_travel_with_the_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize("verbose", [0, 1])
 def test_spaces_that_are_inferred_from_the_data_are_said(verbose: int, capsys: pytest.CaptureFixture[str]) -> None:
     transitions = load_dataset(base_arrays(), action_low=[-1, -2], action_high=[1, 4])
-    words = "observations of 3 unbounded entries, actions of 2 entries in [-1, 1], [-2, 4]"
+    words = "observations of width 3 without bounds, actions of width 2 in [-1, 1], [-2, 4]"
     assert f"spaces of an agent without an environment: {words}" in transitions.summary()
     model = OfflineBC("MlpPolicy", None, dataset=transitions, policy_kwargs={"net_arch": [4]}, verbose=verbose)
     assert (f"No environment: the spaces are taken from arrays, {words}" in capsys.readouterr().out) == (verbose == 1)

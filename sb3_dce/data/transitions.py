@@ -408,7 +408,7 @@ class Transitions:
         low, high = self.info.action_space_low, self.info.action_space_high
         bounds = [f"[{a:.4g}, {b:.4g}]" for a, b in zip(low, high, strict=True)]
         shown = bounds[0] if len(set(bounds)) == 1 else ", ".join(bounds)
-        return f"observations of {self.obs_shape[0]} unbounded entries, actions of {self.act_dim} entries in {shown}"
+        return f"observations of width {self.obs_shape[0]} without bounds, actions of width {self.act_dim} in {shown}"
 
     def _returns_line(self) -> str:
         info, returns, lengths = self.info, self.info.episode_returns, self.info.episode_lengths
