@@ -20,6 +20,7 @@ from sb3_dce import Transitions
 from sb3_dce.data.advice import Penalty, examine
 from sb3_dce.errors import ConfigError, DatasetError, DatasetWarning
 from sb3_dce.report import Behaviour, advise, estimate_behaviour, write_report
+from sb3_dce.report.behaviour import _smallest
 from sb3_dce.report.page import MARKER
 from sb3_dce.report.verdict import observation_scales
 
@@ -117,6 +118,15 @@ def mixture(grouped: bool, rewards_tell: bool) -> Transitions:
     actions = 0.5 * sign * np.tanh(states[:, 0]) + 0.1 * rng.standard_normal(n)
     rewards = rng.standard_normal(n) + (3.0 * sign if rewards_tell else 3.0)
     return episodes_of(states, actions[:, None], rewards, action_low=-2.0, action_high=2.0)
+
+
+@pytest.mark.parametrize("width", [10, 640, 705, 5000])
+def test_smallest_distances_are_those_of_a_full_sort(width: int) -> None:
+    distances = np.random.default_rng(0).permuted(np.tile(np.arange(width, dtype=np.float32), (20, 1)), axis=1)
+    distances[3, distances[3] >= 4] = np.inf  # fewer neighbours than wanted
+    distances[5, :9] = -1.0  # side by side
+    found = np.take_along_axis(distances, _smallest(distances, 10), axis=1)
+    assert np.array_equal(np.sort(found, axis=1), np.sort(distances, axis=1)[:, :10])
 
 
 def test_one_policy_is_not_taken_for_a_mixture() -> None:

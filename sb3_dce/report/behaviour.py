@@ -24,6 +24,8 @@ MIN_PAIRS = 300
 N_GROUPS = 4
 # Distances of so many queries at once: 100 x 100,000 float32 are 40 MB.
 _QUERIES_AT_ONCE = 100
+# Entries of a row of distances of which only the smallest is looked at first.
+_GROUP = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,13 +138,32 @@ def _neighbours(states: np.ndarray, queries: np.ndarray, episodes: np.ndarray) -
         if several:
             squared[episodes[some, None] == episodes] = np.inf
         squared[np.arange(len(some)), some] = np.inf
-        near = np.argpartition(squared, N_NEIGHBOURS, axis=1)[:, :N_NEIGHBOURS]
+        near = _smallest(squared, N_NEIGHBOURS)
         exact = ((states[some, None].astype(np.float64) - states[near]) ** 2).sum(axis=2)
         exact[~np.isfinite(np.take_along_axis(squared, near, axis=1))] = np.inf
         order = np.argsort(exact, axis=1, kind="stable")
         numbers.append(np.take_along_axis(near, order, axis=1))
         distances.append(np.take_along_axis(exact, order, axis=1))
     return np.concatenate(numbers), np.concatenate(distances)
+
+
+def _smallest(values: np.ndarray, n: int) -> np.ndarray:
+    """
+    Numbers of the ``n`` smallest entries of each row, in any order, shape (rows, n).
+
+    In long rows only entries up to the n-th smallest of the minima of groups can be among them, which leaves few to sort: ten
+    times faster than one partition of the row.
+    """
+    n_groups = values.shape[1] // _GROUP
+    if n_groups <= n:
+        return np.argpartition(values, n - 1, axis=1)[:, :n]
+    minima = values[:, : n_groups * _GROUP].reshape(len(values), _GROUP, n_groups).min(axis=1)
+    limits = np.partition(minima, n - 1, axis=1)[:, n - 1]
+    chosen = np.empty((len(values), n), dtype=np.int64)
+    for row, limit, numbers in zip(values, limits, chosen, strict=True):
+        candidates = np.flatnonzero(row <= limit)
+        numbers[:] = candidates[np.argpartition(row[candidates], n - 1)[:n]]
+    return chosen
 
 
 def _at_distance_zero(half_squares: np.ndarray, squared_distances: np.ndarray) -> np.ndarray:
