@@ -83,7 +83,7 @@ def make_rollouts(dataset_id: str, n_episodes: int) -> Rollouts | None:
     """
     if missing_simulator(resolve(dataset_id)) is not None:
         return None
-    return Rollouts(lambda: make_env_if_possible(dataset_id), n_episodes)
+    return Rollouts(lambda: make_env_if_possible(dataset_id), n_episodes, dataset=dataset_id)
 
 
 def rollouts_of(dataset: str | None, n_episodes: int) -> Rollouts | None:
@@ -103,7 +103,7 @@ def rollouts_of(dataset: str | None, n_episodes: int) -> Rollouts | None:
         assert env is not None
         return env
 
-    return Rollouts(make_env, n_episodes)
+    return Rollouts(make_env, n_episodes, dataset=dataset)
 
 
 def evaluate(model: Any, rollouts: Rollouts, seed: int, dataset_id: str | None = None) -> Evaluation:

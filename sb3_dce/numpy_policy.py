@@ -308,21 +308,16 @@ def numpy_policy(policy: Any, normalizer: ObsNormalizer | None = None) -> MLPPol
     :param normalizer: applied to the observation first, as ``VecNormalize`` does
     :return: the twin; ``None`` if the policy cannot be expressed
     """
-    spaces_fit = (
-        isinstance(policy.observation_space, spaces.Box)
-        and len(policy.observation_space.shape) == 1
-        and isinstance(policy.action_space, spaces.Box)
-        and len(policy.action_space.shape) == 1
-    )
-    parts = _actor_parts(policy) if spaces_fit else None
+    parts = actor_parts(policy)
     if parts is None:
         return None
     modules, log_std, extractor, squash = parts
     extracted = _extractor_normalizer(extractor)
-    plain = _layers(modules)
+    plain = plain_layers(modules)
     if extracted is _UNKNOWN or plain is None or (extracted is not None and normalizer is not None):
         return None
-    layers, activation = plain
+    linears, activation = plain
+    layers = [_layer(linear) for linear in linears]
     low, high = policy.action_space.low, policy.action_space.high
     return MLPPolicy(layers, activation, low, high, squash, log_std, extracted or normalizer)
 
@@ -330,8 +325,12 @@ def numpy_policy(policy: Any, normalizer: ObsNormalizer | None = None) -> MLPPol
 _UNKNOWN: Any = object()
 
 
-def _actor_parts(policy: Any) -> tuple[list[Any], Layer | np.ndarray | None, Any, Squash] | None:
-    """Modules of the mean, log std, features extractor, and the way of squashing; ``None`` for an unknown policy."""
+def actor_parts(policy: Any) -> tuple[list[Any], Layer | np.ndarray | None, Any, Squash] | None:
+    """
+    :param policy: policy of Stable-Baselines3 or of this package
+    :return: modules of the mean, log std, features extractor, and the way of squashing; ``None`` for an unknown policy, or
+        one whose observations or actions are no vectors
+    """
     from stable_baselines3.common.distributions import DiagGaussianDistribution
     from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
     from stable_baselines3.common.torch_layers import MlpExtractor
@@ -344,6 +343,9 @@ def _actor_parts(policy: Any) -> tuple[list[Any], Layer | np.ndarray | None, Any
     from sb3_dce.actors import DeterministicActor, GaussianActor
     from sb3_dce.policies import OfflineTD3Policy
 
+    for space in (policy.observation_space, policy.action_space):
+        if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+            return None
     known = (SACPolicy._predict, TD3Policy._predict, OfflineTD3Policy._predict, ActorCriticPolicy._predict, *_contrib())
     if type(policy).predict is not BasePolicy.predict or type(policy)._predict not in known:
         return None
@@ -399,8 +401,12 @@ def _extractor_normalizer(extractor: Any) -> Any:
     return _UNKNOWN
 
 
-def _layers(modules: list[Any]) -> tuple[list[Layer], str] | None:
-    """Linear layers with one activation between them; ``None`` for any other order or kind of modules."""
+def plain_layers(modules: list[Any]) -> tuple[list[Any], str] | None:
+    """
+    :param modules: of an MLP, in order
+    :return: its linear layers and the activation between all of them, a key of :data:`ACTIVATIONS`; ``None`` for any other
+        order or kind of modules
+    """
     from torch import nn
 
     names: dict[type, str] = {nn.ReLU: "relu", nn.Tanh: "tanh", nn.ELU: "elu", nn.LeakyReLU: "leaky_relu", nn.SiLU: "silu"}
@@ -411,7 +417,7 @@ def _layers(modules: list[Any]) -> tuple[list[Layer], str] | None:
         return None
     if len(kinds) > 1 or not kinds <= set(names) or not plain:
         return None
-    return [_layer(module) for module in linear], names[kinds.pop()] if kinds else "relu"
+    return linear, names[kinds.pop()] if kinds else "relu"
 
 
 def _layer(linear: Any) -> Layer:

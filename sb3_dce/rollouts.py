@@ -2,12 +2,13 @@
 Episodes of a deterministic policy, many side by side: the returns of Stable-Baselines3's ``evaluate_policy``, sooner.
 
 Nothing is approximated. The actor computes on the same batch of observations, so actions agree to the last bit; what is left
-out is the work around it: vectorised environments that restart, monitors, distributions that are not sampled.
+out is the work around it: vectorised environments that restart, monitors, distributions that are not sampled, and the parts
+of the simulators' steps that nobody reads.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -18,6 +19,8 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_dce.checks import check_number
 from sb3_dce.envs import without_bookkeeping
+from sb3_dce.locomotion import EnvSteps, fast_steps
+from sb3_dce.mlp_actor import MLPActor, actor_snapshot
 
 Act = Callable[[np.ndarray], np.ndarray]
 
@@ -34,52 +37,137 @@ class Episodes(NamedTuple):
     lengths: tuple[int, ...]
 
 
+class Ending(NamedTuple):
+    """
+    One episode; sorted, episodes are in the order in which they ended.
+
+    :param step: steps since the start of the evaluation
+    :param row: of the environment
+    :param episode_return: undiscounted return, reward units
+    :param length: steps of the episode
+    """
+
+    step: int
+    row: int
+    episode_return: float
+    length: int
+
+
+def in_order(endings: Iterable[Ending]) -> Episodes:
+    """
+    :param endings: of all episodes of an evaluation, which may come from several processes
+    :return: the episodes in the order in which they ended
+    """
+    ordered = sorted(endings)
+    return Episodes(tuple(e.episode_return for e in ordered), tuple(e.length for e in ordered))
+
+
 class Rollouts:
     """
-    Environments that play one episode each, side by side.
+    Environments that play episodes side by side, made when they are first needed.
+
+    With ``n_envs`` environments the returns are those of ``evaluate_policy`` on a ``DummyVecEnv`` of ``n_envs`` environments
+    that was seeded (``vec_env.seed(seed)``): of its first environment with ``seed``, of the next ones with the next numbers.
+    Each plays its share of the episodes; from its second one on it goes on with its own random generator. The default, one
+    environment per episode, is the fastest. ``n_envs=1`` is ``evaluate_policy`` on a single environment. The returns for
+    different ``n_envs`` are those of different starts and so not the same numbers.
 
     :param make_env: makes one environment
-    :param n_episodes: number of environments
-    :raises ConfigError: if it is below 1
+    :param n_episodes: episodes of an evaluation
+    :param n_envs: environments; default: as many as episodes
+    :param dataset: id or name from which :func:`~sb3_dce.evaluation.rollouts_of` makes the same in another process
+    :raises ConfigError: if a number is below 1
     """
 
-    def __init__(self, make_env: Callable[[], gym.Env], n_episodes: int) -> None:
+    def __init__(
+        self,
+        make_env: Callable[[], gym.Env],
+        n_episodes: int,
+        n_envs: int | None = None,
+        dataset: str | None = None,
+    ) -> None:
         check_number("n_eval_episodes", n_episodes, 1, integer=True, hint="Usual are 10.")
-        self._envs = [without_bookkeeping(make_env()) for _ in range(n_episodes)]
+        check_number("n_envs", 1 if n_envs is None else n_envs, 1, integer=True, hint="Leave it out.")
+        self.n_episodes, self.n_envs, self.dataset = n_episodes, n_envs or n_episodes, dataset
+        self._make_env = make_env
+        self._envs: dict[int, gym.Env] = {}
+        self._limit: int | None = None
+        self._steps: tuple[list[int], EnvSteps] | None = None
 
     def play(self, act: Act, seed: int) -> Episodes:
         """
-        One episode in each environment.
+        All episodes.
 
-        :param act: observations of shape (n_episodes, *obs_shape) to actions of shape (n_episodes, *action_shape); rows of
+        :param act: observations of shape (n_envs, *obs_shape) to actions of shape (n_envs, *action_shape); rows of
             environments that are done keep their last observation
         :param seed: seed of the first environment; the next ones have the next numbers
         :return: returns and lengths
         """
-        first = [env.reset(seed=seed + i)[0] for i, (env, _) in enumerate(self._envs)]
-        obs = np.stack(first)
-        rewards: list[list[float]] = [[] for _ in self._envs]
-        returns, lengths = [], []
-        running = list(range(len(self._envs)))
+        return in_order(self.play_rows(act, seed, range(self.n_envs)))
+
+    def play_rows(self, act: Act, seed: int, rows: Iterable[int]) -> list[Ending]:
+        """
+        The episodes of some of the environments. They are what they are beside the others: the actor computes on a batch of
+        ``n_envs`` observations, each in its place, and the bits of a row depend on nothing but the batch's shape.
+
+        :param act: as for :meth:`play`
+        :param seed: as for :meth:`play`
+        :param rows: numbers of the environments
+        :return: their episodes
+        """
+        rows = list(rows)
+        steps = self._make_steps(rows)
+        left = {row: (self.n_episodes + row) // self.n_envs for row in rows}  # the shares of `evaluate_policy`
+        running = [row for row in rows if left[row]]
+        starts = [steps.reset(row, seed + row) for row in running]
+        if not running:
+            return []
+        obs = np.zeros((self.n_envs, *starts[0].shape), starts[0].dtype)
+        obs[running] = starts
+        rewards: dict[int, list[float]] = {row: [] for row in running}
+        limit, t, endings = self._limit, 0, []
         while running:
-            actions = act(obs)
+            t += 1
+            paid, ended = steps.step(running, act(obs), obs)
             still = []
-            for i in running:
-                env, limit = self._envs[i]
-                obs[i], reward, terminated, truncated, _ = env.step(actions[i])
-                rewards[i].append(float(reward))
-                if not (terminated or truncated or len(rewards[i]) == limit):
-                    still.append(i)
+            for row, reward, end in zip(running, paid, ended, strict=True):
+                seen = rewards[row]
+                seen.append(reward)
+                if not (end or len(seen) == limit):
+                    still.append(row)
                     continue
-                returns.append(round(sum(rewards[i]), 6))  # the sum and the rounding of Stable-Baselines3's Monitor
-                lengths.append(len(rewards[i]))
+                # the sum and the rounding of Stable-Baselines3's Monitor
+                endings.append(Ending(t, row, round(sum(seen), 6), len(seen)))
+                left[row] -= 1
+                if left[row]:
+                    obs[row], rewards[row] = steps.reset(row, None), []
+                    still.append(row)
             running = still
-        return Episodes(tuple(returns), tuple(lengths))
+        return endings
+
+    def _make_steps(self, rows: list[int]) -> EnvSteps:
+        if self._steps is None or self._steps[0] != rows:
+            for row in rows:
+                if row not in self._envs:
+                    self._envs[row], self._limit = without_bookkeeping(self._make_env())
+            self._steps = (rows, fast_steps({row: self._envs[row] for row in rows}))
+        return self._steps[1]
 
     def close(self) -> None:
         """Close the environments."""
-        for env, _ in self._envs:
+        for env in self._envs.values():
             env.close()
+        self._envs, self._steps = {}, None
+
+
+def plain_policy(model: Any) -> BasePolicy | None:
+    """
+    :param model: agent of Stable-Baselines3 or of this package, or anything with ``predict``
+    :return: its policy, if ``model.predict`` is the policy's ``predict`` of Stable-Baselines3 and nothing else
+    """
+    policy: Any = getattr(model, "policy", None)
+    own_predict = type(model).predict is not BaseAlgorithm.predict or type(policy).predict is not BasePolicy.predict
+    return None if own_predict or not isinstance(policy, BasePolicy) else policy
 
 
 def deterministic_act(model: Any) -> Act:
@@ -87,12 +175,21 @@ def deterministic_act(model: Any) -> Act:
     What a model does without noise.
 
     :param model: agent of Stable-Baselines3 or of this package, or anything with ``predict``
-    :return: function of a batch of observations; the bits are those of ``model.predict(obs, deterministic=True)``
+    :return: function of a batch of observations; the bits are those of ``model.predict(obs, deterministic=True)``. Weights
+        that change later need another call
     """
-    policy: Any = getattr(model, "policy", None)
-    own_predict = type(model).predict is not BaseAlgorithm.predict or type(policy).predict is not BasePolicy.predict
-    if not isinstance(policy, BasePolicy) or own_predict:
+    policy = plain_policy(model)
+    if policy is None:
         return lambda obs: model.predict(obs, deterministic=True)[0]
+    snapshot = actor_snapshot(policy) if policy.device.type == "cpu" else None
+    return policy_act(policy) if snapshot is None else MLPActor(snapshot)
+
+
+def policy_act(policy: BasePolicy) -> Act:
+    """
+    :param policy: any policy of Stable-Baselines3 with a box of actions
+    :return: function of a batch of observations, the bits of ``policy.predict(obs, deterministic=True)``
+    """
     policy.set_training_mode(False)
     space, device = policy.action_space, policy.device
     shape = space.shape
