@@ -226,7 +226,7 @@ def test_interrupted_recording_goes_on_where_it_was(tmp_path: Path, monkeypatch:
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="children are found as on Linux")
 def test_workers_of_a_killed_recording_end_with_it(tmp_path: Path) -> None:
     code = (
-        "import pathlib, sys; from sb3_dce.recording import RecordingSpec, record; "
+        "import pathlib, sys; from sb3_dce.recording import RecordingSpec, parts, record; parts.FLUSH_ROWS = 1000; "
         "record(RecordingSpec('random', 'Pendulum-v1'), pathlib.Path(sys.argv[1]), n_rows=10**9, workers=2)"
     )
     parent = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "x.hdf5")])
