@@ -18,7 +18,7 @@ from update_tools import all_tensors, largest_difference
 from sb3_dce import OfflineDCE
 from sb3_dce.errors import ConfigError, DivergenceError
 from sb3_dce.population_runs import STATE_FILE, BatchedRuns, train_population
-from sb3_dce.runs import RunSpec, run
+from sb3_dce.runs import RunSpec, read_divergence, run
 
 TINY = "halfcheetah-tiny-sb3"
 QUICK = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 16}
@@ -90,6 +90,24 @@ def test_members_that_diverge_are_named_and_the_others_finish(tmp_path: Path) ->
     with pytest.raises(DivergenceError, match=r"1 of 2 members diverged: dce seed 1.*the others are complete"):
         BatchedRuns(members, CPU, "eager", Console(quiet=True)).run()
     assert (tmp_path / "seed_0" / "result.json").exists() and not (tmp_path / "seed_1" / "result.json").exists()
+    assert read_divergence(tmp_path / "seed_0") is None and read_divergence(tmp_path / "seed_1") is not None
+
+
+def test_two_populations_share_a_folder_by_names_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    quiet = Console(quiet=True)
+    seeds = specs(tmp_path, n=4)
+    first, second = (BatchedRuns(seeds[i : i + 2], CPU, "eager", quiet, state_file=f"{i}.pt") for i in (0, 2))
+
+    def interrupt(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(BatchedRuns, "_finish", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            first.run()
+    assert len(second.run()) == 2 and (tmp_path / "0.pt").exists() and not (tmp_path / "2.pt").exists()
+    again = BatchedRuns(seeds[:2], CPU, "eager", quiet, state_file="0.pt")
+    assert [result["n_updates"] for result in again.run()] == [40, 40] and not (tmp_path / "0.pt").exists()
 
 
 def test_runs_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:

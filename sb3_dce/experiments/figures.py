@@ -44,7 +44,7 @@ def draw(evidence: Evidence, folder: Path, name: str) -> list[Path]:
     if evidence.scale.source == "embedded":
         first = evidence.experiment.datasets[0].paper
         panels = tuple(p for p in panels if p.dataset in (None, first))
-    columns = min(COLUMNS, len(panels))
+    columns = 2 if len(panels) == 4 else min(COLUMNS, len(panels))
     lines = -(-len(panels) // columns)
     # fixed identifiers: the same rows give the same file
     with rc_context({"svg.hashsalt": name}):
@@ -139,4 +139,5 @@ def _panel(evidence: Evidence, panel: Panel, axes: object) -> None:
     if curves:
         axes.legend(fontsize=7)
     else:
+        axes.set(xticks=[], yticks=[])
         axes.text(0.5, 0.5, "no data", ha="center", va="center", transform=axes.transAxes, color="0.4")

@@ -34,6 +34,8 @@ from sb3_dce.hyperparams import did_you_mean
 
 ALL = "all"
 PRESENT = "present"
+# Columns that a terminal has no room for.
+HIDDEN = ("paper: ", "D4RL set")
 # Longest wait for another call with the same folder, seconds.
 WAIT = 7 * 24 * 3600.0
 
@@ -239,16 +241,19 @@ def _report(evidence: Evidence, out: Path, console: Console) -> Report:
 
 
 def _show(name: str, header: tuple[str, ...], rows: tuple[tuple[str, ...], ...], console: Console) -> None:
-    """Of a wide table the terminal gets our own columns and the paper's DCE; the files have all."""
-    shown = [
-        i for i, title in enumerate(header) if not title.startswith("paper: ") or title == "paper: DCE" or len(header) < 10
-    ]
-    view = Table(title=name, box=None, header_style="bold", title_justify="left")
+    """Of a wide table the terminal gets our own columns and the paper's DCE, and no rows without data; the files have all."""
+    wide = len(header) >= 10
+    shown = [i for i, title in enumerate(header) if not wide or not title.startswith(HIDDEN) or title == "paper: DCE"]
+    known = [row for row in rows if not row[0].endswith(": no data")]
+    view = Table(title=name, box=None, header_style="bold", title_justify="left", padding=(0, 1, 0, 0))
     for i in shown:
         view.add_column(header[i].removeprefix("ours: "), justify="left" if i == 0 else "right")
-    for row in rows:
-        view.add_row(*(row[i].replace("**", "") for i in shown))
+    for row in known:
+        view.add_row(*(row[i].replace("**", "").replace(" ± ", "±") for i in shown))
     console.print(view)
+    missing = [row[0].removesuffix(": no data") for row in rows if row[0].endswith(": no data")]
+    if missing:
+        console.print(f"no data: {', '.join(missing)}", markup=False)
 
 
 def _command(request: Request) -> str:

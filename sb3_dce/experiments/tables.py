@@ -195,7 +195,9 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
     rows = []
     for variant in variants:
         scores = [evidence.last(variant, name) for name in ids]
-        sums = total([task.mean() for task in scores], [sample_std(task) for task in scores])
+        stds = [sample_std(task) for task in scores]
+        sums = total([task.mean() for task in scores], stds)
+        spreads = ("-", "-") if np.isnan(stds).any() else (f"{sums.paper_std:.1f}", f"{sums.std:.1f}")
         low, high = bootstrap_interval(scores, iqm)
         chance = "-"
         if dce is not None and variant is not dce:
@@ -205,7 +207,7 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
         rows.append(
             (
                 variant.name,
-                *(f"{value:.1f}" for value in (sums.mean, sums.paper_std, sums.std, mean_of_tasks(scores), iqm(scores))),
+                *(f"{sums.mean:.1f}", *spreads, f"{mean_of_tasks(scores):.1f}", f"{iqm(scores):.1f}"),
                 f"{low:.1f} to {high:.1f}",
                 chance,
                 str(sum(len(task) for task in scores)),
