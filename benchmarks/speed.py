@@ -38,6 +38,8 @@ SAC_NAME = "SAC.train of Stable-Baselines3"
 MANNER_NAME = "DCE in Stable-Baselines3's manner"
 # One entry's turn should last about this long (s): long against the clock, short against changes of the machine's load.
 TURN_SECONDS = 0.7
+# What is compiled is what a run of this many updates would compile.
+LONG_RUN = 1_000_000
 # A turn in which the process waited for the core is thrown away.
 MAX_WALL_PER_CPU = 1.05
 # Multiply-adds of one DCE update per row of the batch, 256-256 networks (sum over its matrix products).
@@ -88,6 +90,7 @@ def make_entries(transitions: Transitions, only: list[str], executions: list[str
             model = agent(
                 "MlpPolicy", env, transitions, execution=execution, precision=precision, batch_size=BATCH, seed=0, device="cpu"
             )
+            model._total_timesteps = LONG_RUN
             entries[f"{algo}, {execution}"] = lambda n, model=model: model.train(n, BATCH)
             if algo == "dce" and MANNER_NAME not in entries:
                 policy = agent("MlpPolicy", env, transitions, seed=0, device="cpu").policy

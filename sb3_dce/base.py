@@ -357,7 +357,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         if engine is None or execution != engine.execution:
             storages = self.make_storages()
             assert execution is not None
-            engine = Engine(self.make_update(storages), TrainState(storages), execution)
+            engine = Engine(self.make_update(storages), TrainState(storages), execution, planned_updates)
             if self._engine is not None:
                 engine.metrics = self._engine.metrics
             self._engine = engine

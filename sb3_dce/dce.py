@@ -448,7 +448,8 @@ def update(
     ent_coef = state[ENT_COEF].params.exp() if options.learned_ent_coef else coef["ent_coef"]
 
     def pi_loss(outputs: tuple[th.Tensor, ...]) -> tuple[th.Tensor, th.Tensor]:
-        actions, log_prob = losses.squashed_gaussian(*outputs, noise["actor"])
+        mean, log_std = outputs
+        actions, log_prob = losses.squashed_gaussian(mean, log_std, noise["actor"])
         q_pi = losses.reduce_critics(nets["critic"](new["critic"].params, s, actions), options.actor_q)
         return losses.sac_actor_loss(log_prob, q_pi, ent_coef), log_prob
 

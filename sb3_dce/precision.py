@@ -90,7 +90,8 @@ def _rounds_itself() -> bool:
 
 def _processor_has(feature: str) -> bool:
     # absent before PyTorch 2.9 and in builds without detection: then nothing is claimed
-    return bool(getattr(th.cpu, "get_capabilities", dict)().get(feature, False))
+    capabilities: Any = getattr(th.cpu, "get_capabilities", dict)()
+    return bool(capabilities.get(feature, False))
 
 
 @functools.cache

@@ -48,7 +48,7 @@ class Forward(NamedTuple):
         :return: outputs without gradient; ``pullback`` maps gradients of a loss by them to its gradient by ``params``, once
         """
         if _is_functional(params):
-            outputs, vjp = th.func.vjp(function, params)
+            outputs, vjp, *_ = th.func.vjp(function, params)
             return cls(outputs, lambda gradients: vjp(gradients)[0])
         leaf = params.detach().requires_grad_(True)
         with th.enable_grad():

@@ -12,7 +12,7 @@ from update_tools import all_tensors, largest_difference, needs_compiler, record
 
 from sb3_dce import OfflineDCE, Transitions
 from sb3_dce.errors import ConfigError, SB3DCEWarning
-from sb3_dce.execution import MetricSums, StaticInputs, choose_execution
+from sb3_dce.execution import UPDATES_WORTH_A_COMPILED_CALLER, MetricSums, StaticInputs, choose_execution
 from sb3_dce.precision import RoundedLinear, _missing, _warn_once, matmul_precision
 
 CPU, CUDA = th.device("cpu"), th.device("cuda")
@@ -214,6 +214,21 @@ def test_a_compiled_update_follows_the_batch_size(transitions: Transitions) -> N
             model.train(2, batch_size)
         models.append(all_tensors(model))
     assert largest_difference(*models) < 1e-10
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_updates_of_a_very_long_run_are_called_from_compiled_code_and_equal_eager_ones(transitions: Transitions) -> None:
+    models = []
+    for execution, planned in (("eager", 0), ("compile", UPDATES_WORTH_A_COMPILED_CALLER)):
+        kwargs = {"dataset": transitions, "policy_kwargs": {"net_arch": [16, 16]}, "seed": 0, "execution": execution}
+        model = to_float64(OfflineDCE("MlpPolicy", **kwargs))
+        model._total_timesteps = planned
+        model.train(50, 16)
+        models.append(model)
+    engine = models[1]._engine
+    assert engine.execution == "compile" and engine._compiler_options == {"cpp_wrapper": True}
+    assert largest_difference(*map(all_tensors, models)) < 1e-10
 
 
 @pytest.mark.skipif(_missing("bf16-matmul", CPU) is not None, reason="needs a processor with bf16 products")
