@@ -96,7 +96,7 @@ def compare(
     find_file(dataset)  # a missing file is said before PyTorch is imported
     from sb3_dce.compare import compare as run_comparison
 
-    names = [name.strip() for name in algos.split(",") if name.strip()]
+    names = list(_names(algos))
     n_workers = workers or os.cpu_count() or 1
     run_comparison(dataset, names, int(updates), range(seeds), eval_freq, eval_episodes, n_workers, out, console)
 
@@ -116,8 +116,11 @@ def reproduce(
     datasets: Annotated[
         str, typer.Option(help="Only these, separated by commas, or [b]present[/b] for those that are on this machine.")
     ] = "",
+    agents: Annotated[str, typer.Option(help="Only these, separated by commas: headings of the table or names.")] = "",
     seeds: Annotated[int, typer.Option(min=0, show_default=False, help="Number of seeds instead of the scale's.")] = 0,
+    first_seed: Annotated[int, typer.Option(min=0, help="The first of them.")] = 0,
     updates: Annotated[float, typer.Option(min=0, show_default=False, help="Gradient steps instead of the scale's.")] = 0,
+    eval_freq: Annotated[int, typer.Option(min=0, show_default=False, help="Steps between two evaluations.")] = 0,
     workers: Annotated[int, typer.Option(min=0, show_default=False, help="Processes; default: one per core.")] = 0,
     device: Annotated[
         str, typer.Option(help="[b]cpu[/b], [b]cuda[/b] (many runs in one computation) or [b]auto[/b].")
@@ -148,9 +151,12 @@ def reproduce(
         ids=experiments.parse_ids(id_),
         scale=scale,
         out=out or Path("runs") / f"reproduce-{scale}",
-        datasets=tuple(name.strip() for name in datasets.split(",") if name.strip()),
+        datasets=_names(datasets),
+        agents=_names(agents),
         seeds=seeds or None,
+        first_seed=first_seed,
         updates=int(updates) or None,
+        eval_freq=eval_freq or None,
         workers=workers or os.cpu_count() or 1,
         device=device,
         ray_address=ray_address,
@@ -177,6 +183,10 @@ def evaluate(
         console.print(f"  episode {number:>3}   return {value:9.1f}   length {length:>5}")
     score = "" if outcome.score is None else f"   normalised score {outcome.score:.1f} ({outcome.dataset_id})"
     console.print(f"return {outcome.mean:.1f} ± {outcome.std:.1f} over {len(outcome.returns)} episodes{score}")
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
 def _parse_overrides(pairs: list[str]) -> dict[str, Any]:

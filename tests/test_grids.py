@@ -156,7 +156,7 @@ def test_what_is_the_same_run_has_one_folder_in_all_experiments(data_folder: Pat
     )
     assert folders["fig-beta", "beta 0"] == folders["fig-sac", "SAC with V, alpha 1"] == folders["bounds", "beta 0"]
     assert table["DCE"] == folders["fig-cql-return", "DCE"] == folders["fig-tau", "expectile 0.7"] == folders["fig-ood", "DCE"]
-    assert table["DCE"] == table["DCE, one setting"], "the commonest row is this dataset's own"
+    assert table["DCE"] == table["DCE one setting"], "the commonest row is this dataset's own"
     # nine of the ablation, four more critics, DCE's own row, two of SAC, six temperatures, four expectiles, the probe
     assert table["BC"] == folders["fig-beta", "BC"] and len(set(folders.values())) == 27
 
@@ -195,6 +195,7 @@ def test_list_names_every_experiment(data_folder: Path) -> None:
         (("table1", "--reuse", "/nowhere/rows"), "no such folder"),
         (("table1", "--updates", "7500"), "do not end with an evaluation"),
         (("table1", "--scale", "cpu"), "sb3-dce datasets generate"),
+        (("table1", "--agents", "DCE,iqll"), "table1 has no agent 'iqll'. It has BC; CQL; DCE; DCE one setting"),
     ],
 )
 def test_wrong_calls_are_one_sentence(

@@ -82,6 +82,14 @@ def test_runs_known_as_rows_are_neither_trained_nor_counted_twice(tmp_path: Path
     assert len(results.done_keys(results.merge([known, new]))) == 3
 
 
+def test_parts_of_a_grid_are_chosen_by_agent_and_seed(tmp_path: Path) -> None:
+    request = Request(("table1",), "smoke", tmp_path, agents=("DCE", "iql"), seeds=1, first_seed=7, updates=4, eval_freq=2)
+    reproduce(request, QUIET)
+    rows = results.read_folder(tmp_path / "rows")
+    assert set(rows["agent"]) == {"dce", "offline_iql"} and set(rows["seed"]) == {7} and set(rows["n_updates"]) == {4}
+    assert sorted(set(rows[rows["metric"] == "score"]["step"])) == [2, 4]
+
+
 def test_run_that_diverges_stops_no_other_and_is_not_begun_again(tmp_path: Path) -> None:
     dce, eq18 = small_plan("fig-cql-return", tmp_path)
     wild = replace(dce, spec=replace(dce.spec, overrides={**dce.spec.overrides, "learning_rate": 1e30}))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -11,6 +12,12 @@ from sb3_dce.dce_probe import PROBE_BETAS
 from sb3_dce.errors import ConfigError
 from sb3_dce.experiments.evidence import UPDATES_PER_EPOCH, Evidence
 from sb3_dce.experiments.grid import Panel, Variant
+from sb3_dce.experiments.statistics import performance_profile
+from sb3_dce.experiments.tables import common_rows
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 LABELS = {
     "score": "normalised score",
@@ -35,24 +42,60 @@ def draw(evidence: Evidence, folder: Path, name: str) -> list[Path]:
     :return: PNG and SVG file
     :raises ConfigError: without matplotlib
     """
-    try:
-        from matplotlib import rc_context
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise ConfigError("figures need matplotlib", key="matplotlib", hint='pip install "sb3_dce[plots]"') from None
     panels = evidence.experiment.panels
     if evidence.scale.source == "embedded":
         first = evidence.experiment.datasets[0].paper
         panels = tuple(p for p in panels if p.dataset in (None, first))
     columns = 2 if len(panels) == 4 else min(COLUMNS, len(panels))
     lines = -(-len(panels) // columns)
-    # fixed identifiers: the same rows give the same file
-    with rc_context({"svg.hashsalt": name}):
-        figure = Figure(figsize=(WIDTH * columns, HEIGHT * lines), layout="constrained")
-        for number, panel in enumerate(panels):
-            _panel(evidence, panel, figure.add_subplot(lines, columns, number + 1))
-        folder.mkdir(parents=True, exist_ok=True)
-        paths = [folder / f"{name}.{ending}" for ending in ("png", "svg")]
+    figure = _figure(WIDTH * columns, HEIGHT * lines)
+    for number, panel in enumerate(panels):
+        _panel(evidence, panel, figure.add_subplot(lines, columns, number + 1))
+    return _save(figure, folder, name)
+
+
+def draw_profile(evidence: Evidence, source: str, folder: Path, name: str) -> list[Path]:
+    """
+    Performance profile: the share of runs with at least a given score, over the data on which all agents have runs.
+
+    :param evidence: of a table
+    :param source: "D4RL" or "sb3", never both
+    :param folder: where the pictures are written
+    :param name: of the files, without ending
+    :return: PNG and SVG file
+    :raises ConfigError: without matplotlib
+    """
+    figure = _figure(1.5 * WIDTH, HEIGHT)
+    axes = figure.add_subplot()
+    ids = common_rows(evidence, source)
+    scores = {v.name: [evidence.last(v, i) for i in ids] for v in evidence.experiment.variants if v.datasets is None}
+    scores = {agent: tasks for agent, tasks in scores.items() if all(len(task) for task in tasks)}
+    every = np.concatenate([task for tasks in scores.values() for task in tasks])
+    thresholds = np.linspace(min(0.0, every.min()), max(100.0, every.max()), 201)
+    for number, (agent, tasks) in enumerate(scores.items()):
+        share = performance_profile(tasks, thresholds)
+        axes.step(thresholds, share, color=f"C{number}", linewidth=1.4, label=agent)
+    axes.set(xlabel="normalised score", ylabel="share of runs above it", ylim=(-0.02, 1.02))
+    axes.set_title(f"{len(ids)} data sets, {'D4RL' if source == 'D4RL' else 'made with this package'}", fontsize=10)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=7)
+    return _save(figure, folder, name)
+
+
+def _figure(width: float, height: float) -> Figure:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise ConfigError("figures need matplotlib", key="matplotlib", hint='pip install "sb3_dce[plots]"') from None
+    return Figure(figsize=(width, height), layout="constrained")  # no pyplot: no window system is touched
+
+
+def _save(figure: Figure, folder: Path, name: str) -> list[Path]:
+    from matplotlib import rc_context
+
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = [folder / f"{name}.{ending}" for ending in ("png", "svg")]
+    with rc_context({"svg.hashsalt": name}):  # fixed identifiers: the same rows give the same file
         for path in paths:
             metadata = {"Software": None} if path.suffix == ".png" else {"Date": None, "Creator": None}
             figure.savefig(path, dpi=110, metadata=metadata)
@@ -113,10 +156,7 @@ def _line(evidence: Evidence, panel: Panel, variant: Variant, dataset_id: str) -
     return lowered, theory
 
 
-def _panel(evidence: Evidence, panel: Panel, axes: object) -> None:
-    from matplotlib.axes import Axes
-
-    assert isinstance(axes, Axes)
+def _panel(evidence: Evidence, panel: Panel, axes: Axes) -> None:
     curves = panel_curves(evidence, panel)
     for number, (name, (curve, theory)) in enumerate(curves.items()):
         color, epochs = f"C{number}", np.asarray(curve.index) / UPDATES_PER_EPOCH

@@ -63,6 +63,10 @@ def _section(name: str, evidence: Evidence, report: Report, link: str) -> list[s
     for table_name, table in report.tables.items():
         if table_name in HEADINGS:
             parts += [f"### {HEADINGS[table_name]}", table.markdown()]
+    for source in ("D4RL", "sb3"):
+        if f"aggregates-{source}" in report.tables:
+            parts += ["### Performance profile", f"![Performance profile]({link}figures/{name}-profile-{source}.png)"]
+            parts += ["Share of all runs above a score, over the data of the aggregates above."]
     if report.has_figure:
         parts += [f"![{experiment.title}]({link}figures/{name}.png)", report.caption]
     if report.verdicts:

@@ -16,7 +16,7 @@ from sb3_dce.data.locking import exclusive
 from sb3_dce.errors import ConfigError
 from sb3_dce.experiments import results
 from sb3_dce.experiments.evidence import Evidence
-from sb3_dce.experiments.figures import draw
+from sb3_dce.experiments.figures import draw, draw_profile
 from sb3_dce.experiments.grid import (
     SCALES,
     Experiment,
@@ -30,11 +30,12 @@ from sb3_dce.experiments.grid import (
 from sb3_dce.experiments.pages import write_page
 from sb3_dce.experiments.reports import Report, count, make_report
 from sb3_dce.experiments.run import execute, is_complete
-from sb3_dce.hyperparams import did_you_mean
+from sb3_dce.hyperparams import did_you_mean, full_name
 
 ALL = "all"
 PRESENT = "present"
-# Columns that a terminal has no room for.
+# Tables with more columns than this, and columns, for which a terminal has no room.
+WIDE = 9
 HIDDEN = ("paper: ", "D4RL set")
 # Longest wait for another call with the same folder, seconds.
 WAIT = 7 * 24 * 3600.0
@@ -49,8 +50,11 @@ class Request:
     :param scale: "smoke", "cpu" or "full"
     :param out: folder of runs, rows, tables and figures
     :param datasets: only these, "present" for those whose files are here; empty for all
+    :param agents: only these, by their headings or agents' names; empty for all
     :param seeds: number of seeds instead of the scale's
+    :param first_seed: the first of them
     :param updates: gradient steps instead of the scale's
+    :param eval_freq: gradient steps between two evaluations instead of the scale's
     :param workers: processes on a CPU
     :param device: "auto", "cpu" or "cuda"
     :param ray_address: of a cluster
@@ -64,8 +68,11 @@ class Request:
     scale: str
     out: Path
     datasets: tuple[str, ...] = ()
+    agents: tuple[str, ...] = ()
     seeds: int | None = None
+    first_seed: int = 0
     updates: int | None = None
+    eval_freq: int | None = None
     workers: int = 1
     device: str = "auto"
     ray_address: str | None = None
@@ -168,15 +175,15 @@ def _count(experiment: Experiment, scale: Scale) -> int:
 
 def _scale(experiment: Experiment, request: Request) -> Scale:
     scale = experiment.scales[request.scale]
-    if request.updates is not None:
-        every = min(scale.eval_freq, request.updates)
-        if request.updates % every:
-            raise ConfigError(
-                f"{request.updates} gradient steps do not end with an evaluation, which there is every {every}",
-                key="--updates",
-                hint=f"Take a multiple of {every}.",
-            )
-        scale = replace(scale, updates=request.updates, eval_freq=every)
+    updates = request.updates or scale.updates
+    every = request.eval_freq or min(scale.eval_freq, updates)
+    if updates % every:
+        raise ConfigError(
+            f"{updates} gradient steps do not end with an evaluation, which there is every {every}",
+            key="--updates",
+            hint=f"Take a multiple of {every}, or another --eval-freq.",
+        )
+    scale = replace(scale, updates=updates, eval_freq=every)
     return scale if request.seeds is None else replace(scale, seeds=request.seeds)
 
 
@@ -186,7 +193,17 @@ def _plan(experiment: Experiment, scale: Scale, request: Request) -> list[Planne
     names: Sequence[str] | None = request.datasets or None
     if names == (PRESENT,):
         names = present_datasets(experiment, scale)
-    return expand(experiment, scale, request.out / "runs", names)
+    seeds = range(request.first_seed, request.first_seed + scale.seeds)
+    planned = expand(experiment, scale, request.out / "runs", names, seeds)
+    if not request.agents:
+        return planned
+    headings = {v.name for v in experiment.variants}
+    algos = {v.algo for v in experiment.variants}
+    wanted = {name if name in headings else full_name(name) for name in request.agents}
+    if unknown := sorted(wanted - headings - algos):
+        hint = f"It has {'; '.join(sorted(headings))}, or all forms of {', '.join(sorted(algos))}."
+        raise ConfigError(f"{experiment.id} has no agent {unknown[0]!r}", key="--agents", hint=hint)
+    return [run for run in planned if {run.variant, run.spec.algo} & wanted]
 
 
 def _say_plan(planned: list[PlannedRun], known: pd.DataFrame, scales: dict[str, Scale], console: Console) -> None:
@@ -226,6 +243,9 @@ def _report(evidence: Evidence, out: Path, console: Console) -> Report:
         written += table.write(out / "tables", f"{experiment.id}-{name}", endings)
         if name != "long":
             _show(name, table.header, table.rows, console)
+    for source in ("D4RL", "sb3"):
+        if f"aggregates-{source}" in report.tables:
+            written += draw_profile(evidence, source, out / "figures", f"{experiment.id}-profile-{source}")
     if report.has_figure:
         written += draw(evidence, out / "figures", experiment.id)
         console.print(report.caption, markup=False)
@@ -241,16 +261,21 @@ def _report(evidence: Evidence, out: Path, console: Console) -> Report:
 
 
 def _show(name: str, header: tuple[str, ...], rows: tuple[tuple[str, ...], ...], console: Console) -> None:
-    """Of a wide table the terminal gets our own columns and the paper's DCE, and no rows without data; the files have all."""
-    wide = len(header) >= 10
-    shown = [i for i, title in enumerate(header) if not wide or not title.startswith(HIDDEN) or title == "paper: DCE"]
+    """A wide table becomes a paragraph per row, with our own columns and the paper's DCE; the files have all."""
     known = [row for row in rows if not row[0].endswith(": no data")]
-    view = Table(title=name, box=None, header_style="bold", title_justify="left", padding=(0, 1, 0, 0))
-    for i in shown:
-        view.add_column(header[i].removeprefix("ours: "), justify="left" if i == 0 else "right")
-    for row in known:
-        view.add_row(*(row[i].replace("**", "").replace(" ± ", "±") for i in shown))
-    console.print(view)
+    if len(header) < WIDE:
+        view = Table(title=name, box=None, header_style="bold", title_justify="left")
+        for i, title in enumerate(header):
+            view.add_column(title, justify="left" if i == 0 else "right")
+        for row in known:
+            view.add_row(*(cell.replace("**", "") for cell in row))
+        console.print(view)
+    else:
+        shown = [i for i, title in enumerate(header) if i and (not title.startswith(HIDDEN) or title == "paper: DCE")]
+        console.print(f"[italic]{name}[/italic]")
+        for row in known:
+            cells = [f"{header[i].removeprefix('ours: ')} {row[i]}" for i in shown]
+            console.print(f"{row[0]}:  {'   '.join(cells)}".replace("**", ""), markup=False)
     missing = [row[0].removesuffix(": no data") for row in rows if row[0].endswith(": no data")]
     if missing:
         console.print(f"no data: {', '.join(missing)}", markup=False)

@@ -248,9 +248,10 @@ def _evaluations(folder: Path, dataset_id: str | None, n_updates: int) -> list[t
     values: list[tuple[int, str, float]] = []
     evaluations = [e for e in read_evaluations(folder, dataset_id) if e.n_updates <= n_updates]
     for e in evaluations:
-        values.append((e.n_updates, "return", e.mean))
         if e.score is not None:
             values.append((e.n_updates, "score", e.score))
+        if e.score is None or e.n_updates == n_updates:  # elsewhere the score says it too
+            values.append((e.n_updates, "return", e.mean))
     if evaluations and evaluations[-1].n_updates == n_updates:
         last = evaluations[-1]
         values += [(n_updates, "n_episodes", len(last.returns)), (n_updates, "mean_length", float(np.mean(last.lengths)))]

@@ -21,8 +21,10 @@ from sb3_dce.population import SCALARS
 from sb3_dce.population_runs import train_population
 from sb3_dce.runs import RunSpec, read_divergence, read_result
 
-# More members than this are trained one population after the other.
+# More members than this are trained one population after the other. The second table is for agents that evaluate
+# their critics on many rows per sample: 10 x 100 of UWAC, 20 of PBRL's ten critics, 30 of CQL.
 MAX_MEMBERS = 64
+MAX_MEMBERS_OF = {"offline_uwac": 5, "offline_pbrl": 15, "offline_cql": 30}
 
 
 def execute(
@@ -107,7 +109,11 @@ def populations(specs: Iterable[RunSpec]) -> list[list[RunSpec]]:
         shape = (data.obs_dim, data.act_dim)
         key = (spec.algo, shape, repr(sorted(fixed.items())), spec.n_updates, spec.eval_freq, spec.n_eval_episodes)
         groups.setdefault(key, []).append(spec)
-    return [group[i : i + MAX_MEMBERS] for group in groups.values() for i in range(0, len(group), MAX_MEMBERS)]
+    cut = []
+    for group in groups.values():
+        size = MAX_MEMBERS_OF.get(group[0].algo, MAX_MEMBERS)
+        cut += [group[i : i + size] for i in range(0, len(group), size)]
+    return cut
 
 
 def _train_group(group: list[RunSpec], device: th.device, console: Console) -> None:
