@@ -17,6 +17,7 @@ from sb3_dce.data.catalog import normalized_score, resolve
 from sb3_dce.data.minari import is_minari_name
 from sb3_dce.envs import make_env_if_possible, make_minari_env, missing_simulator
 from sb3_dce.errors import DatasetError
+from sb3_dce.evaluation_pool import EvaluationPool
 from sb3_dce.files import write_atomically
 from sb3_dce.rollouts import Rollouts, deterministic_act
 
@@ -75,26 +76,28 @@ def catalogue_id(dataset: str | None) -> str | None:
         return None
 
 
-def make_rollouts(dataset_id: str, n_episodes: int) -> Rollouts | None:
+def make_rollouts(dataset_id: str, n_episodes: int, n_envs: int | None = None) -> Rollouts | None:
     """
     :param dataset_id: id of the catalogue
     :param n_episodes: episodes of an evaluation
+    :param n_envs: environments that play them, see :class:`~sb3_dce.rollouts.Rollouts`
     :return: environments to evaluate in, or ``None`` where there is no simulator
     """
     if missing_simulator(resolve(dataset_id)) is not None:
         return None
-    return Rollouts(lambda: make_env_if_possible(dataset_id), n_episodes, dataset=dataset_id)
+    return Rollouts(lambda: make_env_if_possible(dataset_id), n_episodes, n_envs, dataset_id)
 
 
-def rollouts_of(dataset: str | None, n_episodes: int) -> Rollouts | None:
+def rollouts_of(dataset: str | None, n_episodes: int, n_envs: int | None = None) -> Rollouts | None:
     """
     :param dataset: id, file or ``minari:`` name a model was trained on
     :param n_episodes: episodes of an evaluation
+    :param n_envs: environments that play them, see :class:`~sb3_dce.rollouts.Rollouts`
     :return: environments to evaluate in, or ``None`` where none is known or there is no simulator
     """
     dataset_id = catalogue_id(dataset)
     if dataset_id is not None:
-        return make_rollouts(dataset_id, n_episodes)
+        return make_rollouts(dataset_id, n_episodes, n_envs)
     if not is_minari_name(dataset) or make_minari_env(dataset) is None:
         return None
 
@@ -103,13 +106,13 @@ def rollouts_of(dataset: str | None, n_episodes: int) -> Rollouts | None:
         assert env is not None
         return env
 
-    return Rollouts(make_env, n_episodes, dataset=dataset)
+    return Rollouts(make_env, n_episodes, n_envs, dataset)
 
 
 def evaluate(model: Any, rollouts: Rollouts, seed: int, dataset_id: str | None = None) -> Evaluation:
     """
-    Deterministic episodes with fixed seeds: the returns of ``evaluate_policy`` on a ``DummyVecEnv`` with as many
-    environments as episodes, seeded with ``seed``.
+    Deterministic episodes with fixed seeds: the returns of ``evaluate_policy`` on a ``DummyVecEnv`` with as many environments
+    as ``rollouts``, by default one per episode, seeded with ``seed``.
 
     :param model: agent; its ``_n_updates`` is recorded if it has one
     :param rollouts: environments
@@ -145,6 +148,10 @@ class EvaluationCallback(BaseCallback):
     :param folder: where the files are written; earlier evaluations found there are kept
     :param on_evaluation: called with each outcome
     :param save_checkpoint: write ``checkpoint.zip`` after each evaluation
+    :param n_workers: processes among which the episodes of an evaluation are divided; 0 plays them in this process. The
+        returns are the same for a model on the CPU with one thread (workers compute there, with one thread). Scripts with
+        workers train below ``if __name__ == "__main__":``. The workers end with the training
+    :raises ConfigError: if a number is out of range
     """
 
     def __init__(
@@ -156,6 +163,7 @@ class EvaluationCallback(BaseCallback):
         folder: Path | None = None,
         on_evaluation: Callable[[Evaluation], None] | None = None,
         save_checkpoint: bool = False,
+        n_workers: int = 0,
     ) -> None:
         super().__init__()
         check_number("eval_freq", eval_freq, 1, integer=True, hint="The paper uses 5000.")
@@ -166,6 +174,7 @@ class EvaluationCallback(BaseCallback):
         self.folder = folder
         self.on_evaluation = on_evaluation
         self.save_checkpoint = save_checkpoint
+        self.pool = EvaluationPool(n_workers)
         self.evaluations: list[Evaluation] = [] if folder is None else read_evaluations(folder, dataset_id)
 
     def _on_step(self) -> bool:
@@ -176,9 +185,13 @@ class EvaluationCallback(BaseCallback):
                 self.model.save(self.folder / "checkpoint.zip")
         return True
 
+    def _on_training_end(self) -> None:
+        self.pool.close()
+
     def _evaluate(self, rollouts: Rollouts) -> None:
         seed = evaluation_seed(self.seed, self.num_timesteps // self.eval_freq)
-        outcome = evaluate(self.model, rollouts, seed, self.dataset_id)
+        pending = self.pool.submit(self.model, rollouts, seed, parts=self.pool.n_workers)
+        outcome = Evaluation(int(getattr(self.model, "_n_updates", 0)), *pending.result(), self.dataset_id)
         kept = [e for e in self.evaluations if e.n_updates < outcome.n_updates]
         self.evaluations = [*kept, outcome]
         self.logger.record("eval/mean_reward", outcome.mean)

@@ -7,6 +7,7 @@ same runs are processes, one per core.
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,12 +26,12 @@ from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError
 from sb3_dce.evaluation import (
     Evaluation,
     catalogue_id,
-    evaluate,
     evaluation_seed,
     read_evaluations,
     rollouts_of,
     write_evaluations,
 )
+from sb3_dce.evaluation_pool import EvaluationPool, PendingEpisodes
 from sb3_dce.files import write_atomically
 from sb3_dce.launch import launch, progress_display, show_evaluation
 from sb3_dce.population import Population
@@ -47,7 +48,7 @@ def train_population(
     *,
     device: th.device | str = "auto",
     execution: str = "auto",
-    workers: int = 1,
+    workers: int | None = None,
     console: Console | None = None,
     state_file: str = STATE_FILE,
 ) -> list[dict[str, Any]]:
@@ -58,7 +59,8 @@ def train_population(
         folder of its own inside a common one. They may differ in dataset, seed, and numbers such as beta
     :param device: ``"cpu"`` makes each run a process; on ``"cuda"`` they are one batched computation
     :param execution: as in :class:`~sb3_dce.base.OfflineAlgorithm`
-    :param workers: processes on the CPU
+    :param workers: processes. On the CPU each trains one run, default 1; with a GPU they evaluate what was trained so far
+        while the training goes on, default: all cores but one, and 0 lets the training wait for its evaluations
     :param console: where progress is shown; ``None`` shows nothing
     :param state_file: name of the file in the common folder that says how far the population is; two populations with
         folders of their own in one common folder need two names
@@ -69,8 +71,9 @@ def train_population(
     console = console or Console(quiet=True)
     device = get_device(device)
     if device.type == "cpu":
-        return launch(specs, workers, console)
-    return BatchedRuns(specs, device, execution, console, state_file=state_file).run()
+        return launch(specs, workers or 1, console)
+    workers = max(1, (os.cpu_count() or 1) - 1) if workers is None else workers
+    return BatchedRuns(specs, device, execution, console, state_file=state_file, workers=workers).run()
 
 
 class BatchedRuns:
@@ -83,6 +86,7 @@ class BatchedRuns:
     :param console: where progress is shown
     :param own_randomness: see :class:`~sb3_dce.population.Population`
     :param state_file: as for :func:`train_population`
+    :param workers: processes that evaluate while the training goes on; 0 evaluates in this one
     :raises ConfigError: if the runs cannot be trained together
     """
 
@@ -94,7 +98,10 @@ class BatchedRuns:
         console: Console,
         own_randomness: bool = False,
         state_file: str = STATE_FILE,
+        workers: int = 0,
     ) -> None:
+        self._pool = EvaluationPool(workers)
+        self._pending: list[tuple[int, int, str | None, PendingEpisodes]] = []
         self.specs, self.console = list(specs), console
         for name in ("algo", "n_updates", "eval_freq", "n_eval_episodes"):
             values = {getattr(spec, name) for spec in specs}
@@ -128,9 +135,14 @@ class BatchedRuns:
         done = [read_result(folder) for folder in self.folders]
         if all(result is not None and result["n_updates"] == self.total for result in done):
             return [result for result in done if result is not None]
+        with self._pool:
+            return self._run()
+
+    def _run(self) -> list[dict[str, Any]]:
         population = self._population()
         self._say_memory(population)
         started = time.monotonic() - self._seconds_before
+        self._evaluate_again(population)
         with progress_display(self.console) as display:
             task = display.add_task(
                 f"{len(self.specs)} x {self.specs[0].algo}", total=self.total, completed=population.n_updates
@@ -142,6 +154,7 @@ class BatchedRuns:
                 if population.n_updates % self.eval_freq == 0:
                     self._evaluate(models, population.n_updates)
                 self._save(population, time.monotonic() - started)
+        self._collect_evaluations()
         return self._finish(population, time.monotonic() - started)
 
     def _train_until_due(self, population: Population, display: Progress, task: TaskID) -> None:
@@ -196,19 +209,43 @@ class BatchedRuns:
                 self._diverged[index] = population.n_updates
                 self.console.print(f"  {self.specs[index].name} diverged before update {population.n_updates:,}")
 
-    def _evaluate(self, models: Sequence[OfflineAlgorithm], n_updates: int) -> None:
-        for index, (spec, model, folder) in enumerate(zip(self.specs, models, self.folders, strict=True)):
+    def _evaluate(self, models: Sequence[OfflineAlgorithm], n_updates: int, members: Sequence[int] | None = None) -> None:
+        """
+        Begin the evaluation of all members, or of some. What it gives is written when the next one begins, before the
+        checkpoint that makes this one's superfluous: a run that is killed in between evaluates its checkpoint again.
+        """
+        self._collect_evaluations()
+        members = range(len(models)) if members is None else members
+        parts = max(1, self._pool.n_workers // max(1, len(members)))
+        for index in members:
+            spec, model = self.specs[index], models[index]
             if model.dataset not in self._rollouts:
                 self._rollouts[model.dataset] = rollouts_of(model.dataset, spec.n_eval_episodes)
             rollouts = self._rollouts[model.dataset]
             if rollouts is None or index in self._diverged:
                 continue
-            dataset_id = catalogue_id(model.dataset)
             seed = evaluation_seed(spec.seed, n_updates // spec.eval_freq)
-            outcome: Evaluation = evaluate(model, rollouts, seed, dataset_id)
+            episodes = self._pool.submit(model, rollouts, seed, parts)
+            self._pending.append((index, n_updates, catalogue_id(model.dataset), episodes))
+        if not self._pool.n_workers:
+            self._collect_evaluations()
+
+    def _evaluate_again(self, population: Population) -> None:
+        """Members of a checkpoint whose evaluation was not written before the interruption."""
+        n = population.n_updates
+        if n == 0 or n % self.eval_freq:
+            return
+        seen = [{e.n_updates for e in read_evaluations(folder, None)} for folder in self.folders]
+        self._evaluate(population.models, n, [index for index, updates in enumerate(seen) if n not in updates])
+
+    def _collect_evaluations(self) -> None:
+        pending, self._pending = self._pending, []
+        for index, n_updates, dataset_id, episodes in pending:
+            folder = self.folders[index]
+            outcome = Evaluation(n_updates, *episodes.result(), dataset_id)
             earlier = [e for e in read_evaluations(folder, dataset_id) if e.n_updates < n_updates]
             write_evaluations(folder, [*earlier, outcome])
-            show_evaluation(self.console, spec.name, outcome)
+            show_evaluation(self.console, self.specs[index].name, outcome)
 
     def _save(self, population: Population, seconds: float) -> None:
         """All members, then the file that says so; what is older goes last. A kill at any point leaves a whole set."""

@@ -1,0 +1,189 @@
+"""
+Evaluations in worker processes: many policies and episodes at a time, or beside a training that goes on.
+
+A worker gets what is needed to act (0.3 MB of arrays for an MLP policy) and the name of the dataset, makes the environments
+once, and plays. The returns are those of the same evaluation in one process with one thread: a policy's episodes may be
+divided among workers, but each computes on a batch of all of them, with its own in their places.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import multiprocessing as mp
+import pickle
+from collections.abc import Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.policies import BasePolicy
+
+from sb3_dce.checks import check_number
+from sb3_dce.errors import ConfigError, SB3DCEError
+from sb3_dce.mlp_actor import ActorSnapshot, MLPActor, actor_snapshot
+from sb3_dce.processes import prepare_worker
+from sb3_dce.rollouts import Act, Ending, Episodes, Rollouts, deterministic_act, in_order, plain_policy, policy_act
+
+# What a worker needs to act: arrays, or the class of a policy and the file that its `save` makes.
+Payload = ActorSnapshot | tuple[type[BasePolicy], bytes]
+
+
+class EvaluationFailedError(SB3DCEError):
+    """A worker process could not play the episodes."""
+
+
+class PendingEpisodes:
+    """
+    Episodes that are played now or later.
+
+    :param parts: of one evaluation
+    """
+
+    def __init__(self, parts: Sequence[Future[list[Ending]]]) -> None:
+        self._parts = parts
+
+    def done(self) -> bool:
+        """
+        :return: whether :meth:`result` returns at once
+        """
+        return all(part.done() for part in self._parts)
+
+    def result(self) -> Episodes:
+        """
+        Wait for the episodes.
+
+        :return: returns and lengths, in the order of an evaluation in one process
+        :raises EvaluationFailedError: if a worker failed
+        :raises SB3DCEError: what the environment of the dataset raised in the worker
+        """
+        try:
+            return in_order(ending for part in self._parts for ending in part.result())
+        except SB3DCEError:
+            raise
+        except BrokenProcessPool as error:
+            raise EvaluationFailedError(
+                "a worker process of the evaluation has ended unexpectedly",
+                hint="In a script, training must begin below `if __name__ == '__main__':`. Otherwise the process was killed, "
+                "often for lack of memory: take fewer workers.",
+            ) from error
+        except Exception as error:
+            raise EvaluationFailedError(
+                f"the evaluation failed in its worker process: {type(error).__name__}: {error}",
+                hint="Evaluate without workers to see the whole report.",
+            ) from error
+
+
+class EvaluationPool:
+    """
+    Workers that evaluate policies; they are started by the first evaluation and end with the pool or with this process.
+
+    :param n_workers: processes, each with one thread; 0 evaluates in this process, at once
+    :raises ConfigError: if it is negative
+    """
+
+    def __init__(self, n_workers: int) -> None:
+        check_number("n_workers", n_workers, 0, integer=True, hint="0 evaluates in this process.")
+        self.n_workers = n_workers
+        self._executor: ProcessPoolExecutor | None = None
+
+    def submit(self, model: Any, rollouts: Rollouts, seed: int, parts: int = 1) -> PendingEpisodes:
+        """
+        Evaluate a policy as it is now; it may be trained on at once.
+
+        A model with a ``predict`` of its own, or a policy that cannot be sent, is evaluated here before this returns.
+
+        :param model: agent
+        :param rollouts: environments, from :func:`~sb3_dce.evaluation.rollouts_of`
+        :param seed: of the first environment
+        :param parts: workers that share the episodes
+        :return: the episodes
+        :raises ConfigError: if other processes cannot make these environments
+        """
+        payload = _payload(model) if self.n_workers else None
+        if payload is None:
+            here: Future[list[Ending]] = Future()
+            here.set_result(rollouts.play_rows(deterministic_act(model), seed, range(rollouts.n_envs)))
+            return PendingEpisodes([here])
+        if rollouts.dataset is None:
+            raise ConfigError(
+                "only environments that are known by a dataset's name can be made in worker processes",
+                key="n_workers",
+                hint="Use n_workers=0, or environments from sb3_dce.evaluation.rollouts_of.",
+            )
+        recipe = (rollouts.dataset, rollouts.n_episodes, rollouts.n_envs)
+        parts = max(1, min(parts, self.n_workers, rollouts.n_envs))
+        shares = [range(k, rollouts.n_envs, parts) for k in range(parts)]
+        executor = self._started()
+        try:
+            return PendingEpisodes([executor.submit(_play, payload, recipe, seed, share) for share in shares])
+        except BrokenProcessPool as error:
+            broken: Future[list[Ending]] = Future()
+            broken.set_exception(error)
+            return PendingEpisodes([broken])
+
+    def close(self) -> None:
+        """End the workers; what they are at is lost."""
+        executor, self._executor = self._executor, None
+        if executor is None:
+            return
+        for process in list(executor._processes.values()):
+            process.terminate()
+        executor.shutdown(wait=True, cancel_futures=True)
+
+    def __enter__(self) -> EvaluationPool:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.close()
+
+    def _started(self) -> ProcessPoolExecutor:
+        if self._executor is None:
+            context = mp.get_context("spawn")
+            self._executor = ProcessPoolExecutor(self.n_workers, mp_context=context, initializer=_prepare)
+        return self._executor
+
+
+def _payload(model: Any) -> Payload | None:
+    policy = plain_policy(model)
+    if policy is None:
+        return None
+    snapshot = actor_snapshot(policy)
+    if snapshot is not None:
+        return snapshot
+    # not the model: critics' optimizers, data and loggers stay here
+    with contextlib.suppress(pickle.PicklingError, AttributeError, TypeError):
+        stream = io.BytesIO()
+        policy.save(stream)  # type: ignore[arg-type]
+        made = (type(policy), stream.getvalue())
+        pickle.dumps(made)
+        return made
+    return None
+
+
+# -- in the worker ---------------------------------------------------------------------------------------------------
+
+_rollouts: dict[tuple[str, int, int], Rollouts] = {}
+
+
+def _prepare() -> None:
+    prepare_worker()
+    th.set_num_threads(1)
+
+
+def _play(payload: Payload, recipe: tuple[str, int, int], seed: int, rows: range) -> list[Ending]:
+    from sb3_dce.evaluation import rollouts_of  # it imports this module
+
+    if recipe not in _rollouts:
+        made = rollouts_of(*recipe)
+        assert made is not None
+        _rollouts[recipe] = made
+    return _rollouts[recipe].play_rows(_act(payload), seed, rows)
+
+
+def _act(payload: Payload) -> Act:
+    if isinstance(payload, ActorSnapshot):
+        return MLPActor(payload)
+    policy_class, saved = payload
+    return policy_act(policy_class.load(io.BytesIO(saved), device="cpu"))  # type: ignore[arg-type]
