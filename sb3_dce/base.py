@@ -19,7 +19,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 
 from sb3_dce.attaching import AttachingMixin, DatasetLike
 from sb3_dce.buffers import OfflineReplayBuffer
@@ -331,15 +331,22 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         rates = self.learning_rates()
         for name, storage in engine.state.storages.items():
             storage.set_learning_rate(rates.get(f"{name}_learning_rate", rates["learning_rate"]))
+        assert buffer.rows is not None
+        source = (buffer.rows.data_ptr(), buffer.size(), batch_size)
+
+        def draw() -> tuple[ReplayBufferSamples, dict[str, th.Tensor]]:
+            indices = th.randint(buffer.size(), (batch_size,), generator=generator, device=self.device)
+            batch = buffer.gather(indices, self._vec_normalize_env)
+            if dtype != th.float32:
+                batch = batch._replace(**{k: v.to(dtype) for k, v in batch._asdict().items() if v is not None})
+            return batch, {name: spec.draw(generator, self.device, dtype) for name, spec in specs.items()}
+
+        # statistics of VecNormalize are applied on the processor
+        on_device = None if self._vec_normalize_env is not None else generator
         with matmul_precision(self.precision, self.device):
             for _ in range(gradient_steps):
-                rows = buffer.size()
-                indices = th.randint(rows, (batch_size,), generator=generator, device=self.device)
-                batch = buffer.gather(indices, self._vec_normalize_env)
-                if dtype != th.float32:
-                    batch = batch._replace(**{k: v.to(dtype) for k, v in batch._asdict().items() if v is not None})
-                noise = {name: spec.draw(generator, self.device, dtype) for name, spec in specs.items()}
-                engine.step(batch, noise, self._coefficient_tensors(dtype), **self.update_variant(self._n_updates))
+                coef, variant = self._coefficient_tensors(dtype), self.update_variant(self._n_updates)
+                engine.step_drawn(draw, coef, on_device, source, **variant)
                 self._n_updates += 1
                 if self.reads_state_after(self._n_updates):
                     self.read_state(engine.state.read())

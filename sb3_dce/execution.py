@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
 import torch as th
@@ -23,6 +23,8 @@ from sb3_dce.errors import DivergenceError, SB3DCEWarning
 Update = Callable[..., tuple[dict[str, Any], dict[str, th.Tensor]]]
 
 Variant = tuple[tuple[str, Any], ...]
+# what draws (batch, noise) for one update
+Draw = Callable[[], tuple[Any, dict[str, th.Tensor]]]
 # update with write-back: (state, batch, noise, coefficients) -> metrics
 Step = Callable[[dict[str, Any], Any, dict[str, th.Tensor], dict[str, th.Tensor]], dict[str, th.Tensor]]
 
@@ -176,7 +178,8 @@ class Engine(Generic[S]):
         self.metrics = MetricSums()
         self._update = update
         self._compiled: dict[Variant, Step] = {}
-        self._captured: dict[Variant, CapturedStep] = {}
+        self._captured: dict[tuple[Variant, Hashable], CapturedStep] = {}
+        self._inputs: dict[Variant, StaticInputs] = {}
         self._guarded_for: set[tuple[Variant, tuple[th.Size, ...]]] = set()
 
     def step(self, batch: Any, noise: dict[str, th.Tensor], coef: dict[str, th.Tensor], **variant: Any) -> None:
@@ -196,7 +199,30 @@ class Engine(Generic[S]):
                 with self._guards_evaluated_once(key, batch):
                     self.metrics.add(self._compiled_step(key)(self.state.read(), batch, noise, coef))
             else:
-                self._captured_step(key, batch, noise, coef).replay(batch, noise)
+                inputs = self._inputs.get(key)
+                if inputs is None or not inputs.fits(batch):
+                    self._captured.pop((key, None), None)
+                    inputs = self._inputs[key] = StaticInputs.like(batch, noise)
+                inputs.fill(batch, noise)
+                self._captured_step(key, lambda: inputs, coef).replay()
+
+    def step_drawn(
+        self, draw: Draw, coef: dict[str, th.Tensor], generator: th.Generator | None, source: Hashable, **variant: Any
+    ) -> None:
+        """
+        One update on rows and noise that are still to be drawn; a captured update draws them itself.
+
+        :param draw: draws and gathers; on a CUDA device without a detour over the processor
+        :param coef: coefficients, the same tensors at every call
+        :param generator: what ``draw`` draws with, or ``None`` if it does take that detour
+        :param source: changes when ``draw`` has another number or place of rows
+        :param variant: choices fixed at trace time, such as ``with_actor``
+        """
+        if self.execution != "cudagraph" or generator is None:
+            self.step(*draw(), coef, **variant)
+            return
+        with th.no_grad():
+            self._captured_step(tuple(sorted(variant.items())), draw, coef, generator, source).replay()
 
     @contextlib.contextmanager
     def _guards_evaluated_once(self, key: Variant, batch: Any) -> Iterator[None]:
@@ -234,12 +260,18 @@ class Engine(Generic[S]):
         return first_call
 
     def _captured_step(
-        self, key: Variant, batch: Any, noise: dict[str, th.Tensor], coef: dict[str, th.Tensor]
+        self,
+        key: Variant,
+        draw: Draw,
+        coef: dict[str, th.Tensor],
+        generator: th.Generator | None = None,
+        source: Hashable = None,
     ) -> CapturedStep:
-        captured = self._captured.get(key)
-        if captured is None or not captured.fits(batch, coef):
+        captured = self._captured.get((key, source))
+        if captured is None or not captured.reads(coef, generator):
             step = self._compiled_step(key) if _has_compiler() else self._in_place(dict(key))
-            captured = self._captured[key] = CapturedStep(step, self.state.read(), batch, noise, coef, self.metrics)
+            captured = CapturedStep(step, self.state.read(), draw, coef, self.metrics, generator)
+            self._captured[key, source] = captured
         return captured
 
     def _in_place(self, variant: dict[str, Any]) -> Step:
@@ -269,6 +301,14 @@ class StaticInputs(NamedTuple):
         """
         return cls(*tree_map(lambda leaf: leaf.clone() if isinstance(leaf, th.Tensor) else leaf, (batch, noise)))
 
+    def fits(self, batch: Any) -> bool:
+        """
+        :param batch: replay data
+        :return: whether it has the shapes given at first
+        """
+        pairs = zip(tree_leaves(self.batch), tree_leaves(batch), strict=True)
+        return all(old.shape == new.shape for old, new in pairs if isinstance(old, th.Tensor))
+
     def fill(self, batch: Any, noise: dict[str, th.Tensor]) -> None:
         """
         :param batch: replay data of the shapes given at first
@@ -285,43 +325,41 @@ class CapturedStep:
 
     :param step: update with write-back
     :param state: tensors of the model, which must stay where they are
-    :param batch: replay data of the first update
-    :param noise: its random numbers
+    :param draw: gives batch and noise; captured, too
     :param coef: coefficients, read at every replay from where they are now
     :param metrics: sums that the graph adds to
+    :param generator: what ``draw`` draws with on the device; every replay goes on in its stream of numbers as eager draws do
     """
 
     # Compiler and libraries allocate and tune during the first calls, which a capture does not allow.
     WARM_UP = 3
 
     def __init__(
-        self, step: Step, state: Any, batch: Any, noise: Any, coef: dict[str, th.Tensor], metrics: MetricSums
+        self,
+        step: Step,
+        state: Any,
+        draw: Draw,
+        coef: dict[str, th.Tensor],
+        metrics: MetricSums,
+        generator: th.Generator | None = None,
     ) -> None:
-        self._step, self._state, self._coef, self._metrics = step, state, coef, metrics
-        self._inputs = StaticInputs.like(batch, noise)
+        self._step, self._state, self._draw, self._coef, self._metrics = step, state, draw, dict(coef), metrics
+        self._generator = generator
         self._stream = th.cuda.Stream()
         self._calls = 0
         self._graph: th.cuda.CUDAGraph | None = None
         self._names: tuple[str, ...] = ()
 
-    def fits(self, batch: Any, coef: dict[str, th.Tensor]) -> bool:
+    def reads(self, coef: dict[str, th.Tensor], generator: th.Generator | None) -> bool:
         """
-        :param batch: replay data
         :param coef: coefficients
-        :return: whether the graph reads these coefficients and has room for this batch
+        :param generator: source of randomness
+        :return: whether it is these that the graph reads
         """
-        pairs = zip(tree_leaves(self._inputs.batch), tree_leaves(batch), strict=True)
-        same_shapes = all(old.shape == new.shape for old, new in pairs if isinstance(old, th.Tensor))
-        return same_shapes and all(coef[name] is tensor for name, tensor in self._coef.items())
+        return self._generator is generator and all(coef[name] is tensor for name, tensor in self._coef.items())
 
-    def replay(self, batch: Any, noise: dict[str, th.Tensor]) -> None:
-        """
-        One update.
-
-        :param batch: replay data
-        :param noise: random numbers
-        """
-        self._inputs.fill(batch, noise)
+    def replay(self) -> None:
+        """One update."""
         if self._graph is not None:
             self._graph.replay()
             self._metrics.count(self._names)
@@ -334,10 +372,13 @@ class CapturedStep:
         self._calls += 1
         if self._calls == self.WARM_UP:
             graph = th.cuda.CUDAGraph()
+            if self._generator is not None:
+                graph.register_generator_state(self._generator)
             with th.cuda.graph(graph, stream=self._stream):  # computes nothing yet
                 self._run()
             self._graph = graph
 
     def _run(self) -> None:
-        metrics = self._step(self._state, self._inputs.batch, self._inputs.noise, self._coef)
+        batch, noise = self._draw()
+        metrics = self._step(self._state, batch, noise, self._coef)
         self._names = self._metrics.accumulate(metrics)

@@ -129,10 +129,17 @@ class Population:
             model.policy.set_training_mode(True)
         engine = self._bound_engine(total)
         specs = first.noise_specs(first.batch_size)
+
+        def draw() -> tuple[dict[str, th.Tensor], dict[str, th.Tensor]]:
+            indices, noise = self._draw(specs, first.batch_size)
+            return self._gather(indices), noise
+
+        # what each member draws for itself comes from its model, on the processor
+        on_device = None if self.own_randomness else self._generator
         with matmul_precision(first.precision, self.device):
             for _ in range(n_updates):
-                indices, noise = self._draw(specs, first.batch_size)
-                engine.step(self._gather(indices), noise, self._coefficients(total), **first.update_variant(self._n_updates))
+                coef, variant = self._coefficients(total), first.update_variant(self._n_updates)
+                engine.step_drawn(draw, coef, on_device, first.batch_size, **variant)
                 self._n_updates += 1
                 if first.reads_state_after(self._n_updates):
                     for index, model in enumerate(self.models):

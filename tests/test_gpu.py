@@ -57,6 +57,28 @@ def test_replays_use_new_noise_and_new_rows(transitions: Transitions) -> None:
     assert len(set(before)) == 4
 
 
+def test_a_captured_update_follows_the_batch_size_the_seed_and_the_data(transitions: Transitions) -> None:
+    eager, captured = (make(transitions, execution=execution) for execution in ("eager", "cudagraph"))
+    for model in (eager, captured):
+        for batch_size in (8, 12, 8):
+            model.train(6, batch_size)
+        model.set_random_seed(3)
+        model.train(6, 8)
+        model.set_dataset(transitions)
+        model.train(6, 8)
+    assert largest_difference(all_tensors(eager), all_tensors(captured)) <= 1e-10
+
+
+def test_a_saved_captured_run_goes_on_with_the_same_numbers(transitions: Transitions, tmp_path: Path) -> None:
+    model = OfflineDCE("MlpPolicy", dataset=transitions, device="cuda", execution="cudagraph", **SMALL).learn(20)
+    model.save(tmp_path / "model.zip")
+    loaded = OfflineDCE.load(tmp_path / "model.zip", device="cuda")
+    loaded.set_dataset(transitions)
+    for each in (model, loaded):
+        each.learn(10, reset_num_timesteps=False)
+    assert largest_difference(all_tensors(model), all_tensors(loaded)) <= 1e-5
+
+
 def test_a_thousand_replays_allocate_nothing(transitions: Transitions) -> None:
     model = make(transitions, execution="cudagraph")
     model.train(20, 8)
