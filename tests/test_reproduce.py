@@ -9,6 +9,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -22,13 +23,13 @@ from sb3_dce import OfflineDCE
 from sb3_dce.data import write_hdf5
 from sb3_dce.data.locate import DATASETS_VARIABLE
 from sb3_dce.dce_probe import PROBE_BETAS, OfflineDCEProbe
-from sb3_dce.errors import ConfigError, DivergenceError
+from sb3_dce.errors import ConfigError
 from sb3_dce.experiments import results
 from sb3_dce.experiments.grid import PlannedRun, Scale, expand, load_experiment
 from sb3_dce.experiments.probe import prepare_probe
-from sb3_dce.experiments.reproduce import Request, reproduce
+from sb3_dce.experiments.reproduce import Request, plan_runs, reproduce, scale_of
 from sb3_dce.experiments.run import execute, is_complete, populations
-from sb3_dce.runs import RunSpec, read_divergence, run
+from sb3_dce.runs import read_divergence, run
 from sb3_dce.training import load_any
 
 TINY = "halfcheetah-tiny-sb3"
@@ -52,7 +53,7 @@ def models(folder: Path) -> dict[str, int]:
 
 
 def test_one_command_trains_reports_and_goes_on(tmp_path: Path) -> None:
-    arguments = ("--updates", "20", "--out", str(tmp_path), "--workers", "2")
+    arguments = ("--updates", "20", "--out", str(tmp_path), "--workers", "1")
     first = sb3_dce("reproduce", "fig-cql-return", *arguments)
     assert first.code == 0, first.stderr
     assert "2 runs of 20 gradient steps, 0 of them complete" in first.stdout
@@ -83,30 +84,47 @@ def test_runs_known_as_rows_are_neither_trained_nor_counted_twice(tmp_path: Path
 
 
 def test_parts_of_a_grid_are_chosen_by_agent_and_seed(tmp_path: Path) -> None:
-    request = Request(("table1",), "smoke", tmp_path, agents=("DCE", "iql"), seeds=1, first_seed=7, updates=4, eval_freq=2)
-    reproduce(request, QUIET)
-    rows = results.read_folder(tmp_path / "rows")
-    assert set(rows["agent"]) == {"dce", "offline_iql"} and set(rows["seed"]) == {7} and set(rows["n_updates"]) == {4}
-    assert sorted(set(rows[rows["metric"] == "score"]["step"])) == [2, 4]
+    request = Request(("table1",), "smoke", tmp_path, agents=("DCE", "iql"), seeds=2, first_seed=7, updates=4, eval_freq=2)
+    experiment = load_experiment("table1")
+    planned = plan_runs(experiment, scale_of(experiment, request), request)
+    assert [(r.variant, r.spec.seed) for r in planned] == [("IQL", 7), ("DCE", 7), ("IQL", 8), ("DCE", 8)]
+    assert {(r.spec.n_updates, r.spec.eval_freq) for r in planned} == {(4, 2)}
 
 
-def test_run_that_diverges_stops_no_other_and_is_not_begun_again(tmp_path: Path) -> None:
-    dce, eq18 = small_plan("fig-cql-return", tmp_path)
-    wild = replace(dce, spec=replace(dce.spec, overrides={**dce.spec.overrides, "learning_rate": 1e30}))
-    (text,) = train([wild, eq18])
-    assert "diverged between updates 0 and" in text
-    assert is_complete(wild.spec) and is_complete(eq18.spec) and read_divergence(Path(wild.spec.folder)) is not None
-    assert train([wild, eq18]) == []
-    rows = results.planned_rows([wild, eq18])
-    assert set(rows[rows["metric"] == "diverged"]["agent"]) == {"dce"}
+class Faulty(NamedTuple):
+    wild: PlannedRun
+    wrong: PlannedRun
+    good: PlannedRun
+    error: str
 
 
-def test_error_of_a_run_is_said_after_the_others_have_been_run(tmp_path: Path) -> None:
-    dce, eq18 = small_plan("fig-cql-return", tmp_path)
-    wrong = replace(dce, spec=replace(dce.spec, overrides={**dce.spec.overrides, "beta": -1.0}))
-    with pytest.raises(ConfigError, match="beta must be"):
-        train([wrong, eq18], workers=1)
-    assert is_complete(eq18.spec) and not is_complete(wrong.spec)
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory: pytest.TempPathFactory) -> Faulty:
+    """Three runs started together: one diverges, one has a wrong parameter, one is well."""
+    folder = tmp_path_factory.mktemp("faulty")
+    dce, good = small_plan("fig-cql-return", folder)
+
+    def changed(name: str, **overrides: object) -> PlannedRun:
+        return replace(dce, spec=replace(dce.spec, folder=str(folder / name), overrides={**dce.spec.overrides, **overrides}))
+
+    wild, wrong = changed("wild", learning_rate=1e30), changed("wrong", beta=-1.0)
+    with pytest.raises(ConfigError) as raised:
+        train([wild, wrong, good], workers=1)
+    return Faulty(wild, wrong, good, str(raised.value))
+
+
+def test_error_of_a_run_is_said_after_the_others_have_been_run(faulty: Faulty) -> None:
+    assert "beta must be" in faulty.error
+    assert is_complete(faulty.good.spec) and not is_complete(faulty.wrong.spec)
+
+
+def test_run_that_diverges_is_a_result_and_is_not_begun_again(faulty: Faulty) -> None:
+    found = read_divergence(Path(faulty.wild.spec.folder))
+    assert found is not None and found["n_updates"] <= 40 and "not finite" in found["reason"]
+    assert is_complete(faulty.wild.spec)
+    assert train([faulty.wild, faulty.good]) == []
+    rows = results.planned_rows([faulty.wild, faulty.good])
+    assert set(rows[rows["metric"] == "diverged"]["agent"]) == {"dce"} and len(results.done_keys(rows)) == 2
 
 
 def test_runs_that_can_be_batched_are_one_population(tmp_path: Path) -> None:
@@ -147,7 +165,9 @@ def test_probe_starts_with_the_best_policy_and_keeps_it(tmp_path: Path) -> None:
     dce, probe = small_plan("fig-ood", tmp_path)
     with pytest.raises(ConfigError, match="needs the last policy of the DCE run"):
         prepare_probe(probe.spec, Path(dce.spec.folder))
-    train([dce, probe])
+    run(dce.spec)
+    prepare_probe(probe.spec, Path(dce.spec.folder))
+    run(probe.spec)
     trained, measured = (
         agent.load(Path(r.spec.folder) / "model.zip") for agent, r in ((OfflineDCE, dce), (OfflineDCEProbe, probe))
     )
@@ -281,13 +301,3 @@ def test_files_from_a_node_are_written_inside_the_run_only(tmp_path: Path) -> No
     receive(tmp_path / "run", {"result.json": b"{}", "../outside": b"x", "model.zip": b"y"})
     assert {path.name for path in (tmp_path / "run").iterdir()} == {"result.json", "model.zip"}
     assert not (tmp_path / "outside").exists()
-
-
-def test_divergence_is_written_where_the_run_is(tmp_path: Path) -> None:
-    from sb3_dce.launch import train_one
-
-    spec = RunSpec("dce", TINY, 0, 30, str(tmp_path / "run"), 10, 1, {**QUICK, "learning_rate": 1e30})
-    with pytest.raises(DivergenceError):
-        train_one(spec, lambda progress: None)
-    found = read_divergence(tmp_path / "run")
-    assert found is not None and found["n_updates"] <= 30 and "not finite" in found["reason"]

@@ -105,7 +105,7 @@ def reproduce(request: Request, console: Console) -> dict[str, Report]:
         hint = f"{did_you_mean(request.scale, SCALES)}There are {', '.join(SCALES)}."
         raise ConfigError(f"no scale {request.scale!r}", key="--scale", hint=hint)
     experiments = [load_experiment(name) for name in request.ids]
-    scales = {e.id: _scale(e, request) for e in experiments}
+    scales = {e.id: scale_of(e, request) for e in experiments}
     for folder in (*request.reuse, *request.imports):
         if not folder.is_dir():
             raise ConfigError("no such folder", where=str(folder), key="--reuse/--import", hint="Check the path.")
@@ -136,7 +136,7 @@ def _known(request: Request) -> pd.DataFrame:
 
 def _train(request: Request, experiments: list[Experiment], scales: dict[str, Scale], console: Console) -> pd.DataFrame:
     """Run what is missing and keep its rows; all rows there are then."""
-    planned = [run for e in experiments for run in _plan(e, scales[e.id], request)]
+    planned = [run for e in experiments for run in plan_runs(e, scales[e.id], request)]
     imported = results.merge(results.import_runs(folder, request.ids[0]) for folder in request.imports)
     known = results.merge([_known(request), imported])
     _say_plan(planned, known, scales, console)
@@ -173,7 +173,13 @@ def _count(experiment: Experiment, scale: Scale) -> int:
     )
 
 
-def _scale(experiment: Experiment, request: Request) -> Scale:
+def scale_of(experiment: Experiment, request: Request) -> Scale:
+    """
+    :param experiment: one of the request's
+    :param request: with its changes of length, evaluations and seeds
+    :return: the scale with them
+    :raises ConfigError: if the last evaluation would not be at the end
+    """
     scale = experiment.scales[request.scale]
     updates = request.updates or scale.updates
     every = request.eval_freq or min(scale.eval_freq, updates)
@@ -187,7 +193,14 @@ def _scale(experiment: Experiment, request: Request) -> Scale:
     return scale if request.seeds is None else replace(scale, seeds=request.seeds)
 
 
-def _plan(experiment: Experiment, scale: Scale, request: Request) -> list[PlannedRun]:
+def plan_runs(experiment: Experiment, scale: Scale, request: Request) -> list[PlannedRun]:
+    """
+    :param experiment: one of the request's
+    :param scale: with the request's changes
+    :param request: with its choice of data, agents and seeds
+    :return: runs
+    :raises ConfigError: for an agent or a dataset that is not in the grid
+    """
     if not experiment.datasets:
         return []
     names: Sequence[str] | None = request.datasets or None
