@@ -29,7 +29,7 @@ from sb3_dce.experiments.grid import PlannedRun, Scale, expand, load_experiment
 from sb3_dce.experiments.probe import prepare_probe
 from sb3_dce.experiments.reproduce import Request, plan_runs, reproduce, scale_of
 from sb3_dce.experiments.run import execute, is_complete, populations
-from sb3_dce.runs import read_divergence, run
+from sb3_dce.runs import RunSpec, read_divergence, run
 from sb3_dce.training import load_any
 
 TINY = "halfcheetah-tiny-sb3"
@@ -89,6 +89,18 @@ def test_parts_of_a_grid_are_chosen_by_agent_and_seed(tmp_path: Path) -> None:
     planned = plan_runs(experiment, scale_of(experiment, request), request)
     assert [(r.variant, r.spec.seed) for r in planned] == [("IQL", 7), ("DCE", 7), ("IQL", 8), ("DCE", 8)]
     assert {(r.spec.n_updates, r.spec.eval_freq) for r in planned} == {(4, 2)}
+
+
+def test_runs_of_other_commands_become_rows_without_training(tmp_path: Path) -> None:
+    run(RunSpec("dce", TINY, 5, 4, str(tmp_path / "compare" / "dce" / "seed_5"), 2, 1, QUICK))
+    arguments = ("--report-only", "--out", str(tmp_path / "out"))
+    first = sb3_dce("reproduce", "table1", *arguments, "--import", str(tmp_path / "compare"))
+    assert first.code == 0, first.stderr
+    rows = results.read_folder(tmp_path / "out" / "rows")
+    assert set(rows["seed"]) == {5} and set(rows["experiment"]) == {"table1"}
+    before = (tmp_path / "out" / "rows" / "table1.csv.gz").read_bytes()
+    assert sb3_dce("reproduce", "table1", *arguments, "--import", str(tmp_path / "compare")).code == 0
+    assert (tmp_path / "out" / "rows" / "table1.csv.gz").read_bytes() == before, "nothing is counted twice"
 
 
 class Faulty(NamedTuple):

@@ -35,7 +35,7 @@ from sb3_dce.hyperparams import did_you_mean, full_name
 ALL = "all"
 PRESENT = "present"
 # Tables with more columns than this, and columns, for which a terminal has no room.
-WIDE = 9
+WIDE = 12
 HIDDEN = ("paper: ", "D4RL set")
 # Longest wait for another call with the same folder, seconds.
 WAIT = 7 * 24 * 3600.0
@@ -59,7 +59,7 @@ class Request:
     :param device: "auto", "cpu" or "cuda"
     :param ray_address: of a cluster
     :param reuse: folders of rows; the runs in them count as done
-    :param imports: folders of runs made by other commands, taken over as rows
+    :param imports: folders of runs made by other commands, taken over as rows of the first experiment
     :param report_only: train nothing
     :param page: results page to write
     """
@@ -115,10 +115,10 @@ def reproduce(request: Request, console: Console) -> dict[str, Report]:
         with exclusive(request.out / ".lock", limit=WAIT, note=lambda text: console.print(text, markup=False)):
             rows = _train(request, experiments, scales, console)
     else:
-        known = _known(request)
-        rows = results.merge(
-            [known, *(results.import_runs(f, request.ids[0]) for f in (request.out / "runs", *request.imports))]
-        )
+        rows = results.merge([_known(request), *(results.import_runs(f, request.ids[0]) for f in request.imports)])
+        _keep_rows(rows, request)
+        # runs of an unfinished call with this folder are shown, and left for it to keep
+        rows = results.merge([rows, results.import_runs(request.out / "runs", request.ids[0])])
     evidences, reports = {}, {}
     for experiment in experiments:
         length = request.updates if request.report_only else scales[experiment.id].updates
