@@ -58,10 +58,10 @@ def test_bold_is_what_cannot_be_told_from_the_best() -> None:
     assert bold.pop("BC") is False and all(bold.values())
 
 
-def test_rows_without_results_say_no_data() -> None:
+def test_rows_without_results_say_whether_there_are_data() -> None:
     table = score_table(evidence_of(table_rows(TABLE, {"walker2d-medium-sb3": scores()})))
     assert len(table.rows) == 12
-    assert sum("no data" in row[0] for row in table.rows) == 11
+    assert sum(row[0].endswith(": not run") for row in table.rows) == 11
     kitchen = score_table(evidence_of(results.empty(), "table-adroit-kitchen"))
     assert {row[0] for row in kitchen.rows} >= {f"kitchen-{kind}-v0: no data" for kind in ("complete", "partial", "mixed")}
 

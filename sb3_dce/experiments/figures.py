@@ -180,4 +180,10 @@ def _panel(evidence: Evidence, panel: Panel, axes: Axes) -> None:
         axes.legend(fontsize=7)
     else:
         axes.set(xticks=[], yticks=[])
-        axes.text(0.5, 0.5, "no data", ha="center", va="center", transform=axes.transAxes, color="0.4")
+        axes.text(0.5, 0.5, _absence(evidence, panel), ha="center", va="center", transform=axes.transAxes, color="0.4")
+
+
+def _absence(evidence: Evidence, panel: Panel) -> str:
+    experiment = evidence.experiment
+    shown = [experiment.dataset(name) for name in panel.over or (panel.dataset or experiment.datasets[0].paper,)]
+    return " / ".join(dict.fromkeys(dataset.absence for dataset in shown))

@@ -77,6 +77,13 @@ class GridDataset:
         """
         return (self.paper,) if self.twin is None else (self.paper, self.twin)
 
+    @property
+    def absence(self) -> str:
+        """
+        :return: what to say where there are no results: without D4RL's file there can be none for Kitchen
+        """
+        return "no data" if self.twin is None else "not run"
+
 
 @dataclass(frozen=True)
 class Panel:

@@ -36,6 +36,7 @@ ALL = "all"
 PRESENT = "present"
 # Tables with more columns than this, and columns, for which a terminal has no room.
 WIDE = 12
+ABSENT = (": no data", ": not run")
 HIDDEN = ("paper: ", "D4RL set")
 # Longest wait for another call with the same folder, seconds.
 WAIT = 7 * 24 * 3600.0
@@ -275,7 +276,7 @@ def _report(evidence: Evidence, out: Path, console: Console) -> Report:
 
 def _show(name: str, header: tuple[str, ...], rows: tuple[tuple[str, ...], ...], console: Console) -> None:
     """A wide table becomes a paragraph per row, with our own columns and the paper's DCE; the files have all."""
-    known = [row for row in rows if not row[0].endswith(": no data")]
+    known = [row for row in rows if not row[0].endswith(ABSENT)]
     if len(header) < WIDE:
         view = Table(title=name, box=None, header_style="bold", title_justify="left")
         for i, title in enumerate(header):
@@ -289,9 +290,9 @@ def _show(name: str, header: tuple[str, ...], rows: tuple[tuple[str, ...], ...],
         for row in known:
             cells = [f"{header[i].removeprefix('ours: ')} {row[i]}" for i in shown]
             console.print(f"{row[0]}:  {'   '.join(cells)}".replace("**", ""), markup=False)
-    missing = [row[0].removesuffix(": no data") for row in rows if row[0].endswith(": no data")]
+    missing = [row[0] for row in rows if row[0].endswith(ABSENT)]
     if missing:
-        console.print(f"no data: {', '.join(missing)}", markup=False)
+        console.print("; ".join(missing), markup=False)
 
 
 def _command(request: Request) -> str:

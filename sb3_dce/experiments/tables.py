@@ -91,7 +91,7 @@ def score_table(evidence: Evidence) -> TextTable:
     Scores of all agents on all data, and the paper's beside them.
 
     :param evidence: of an experiment with a table
-    :return: one row per file; a dataset of the paper without results is a row "no data"
+    :return: one row per file; a dataset of the paper without results is a row "not run" or "no data"
     """
     variants = list(evidence.experiment.variants)
     methods = [v.paper for v in variants if v.paper is not None]
@@ -102,7 +102,7 @@ def score_table(evidence: Evidence) -> TextTable:
         printed = tuple(_paper_cell(paper, method) for method in methods)
         ids = evidence.ids(dataset)
         if not ids and evidence.scale.source != "embedded":
-            rows.append((f"{dataset.twin or dataset.paper}: no data", *("" for _ in variants), paper, *printed))
+            rows.append((f"{dataset.twin or dataset.paper}: {dataset.absence}", *("" for _ in variants), paper, *printed))
         for name in ids:
             best = _best_interval([evidence.last(v, name) for v in variants])
             cells = tuple(score_cell(evidence, v, name, best) for v in variants)
