@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from loading import RESULTS, machine
 from recording import find_policies
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -69,9 +70,10 @@ def make_model(dataset_id: str, policy: str | None) -> OfflineDCE:
     model = OfflineDCE("MlpPolicy", make_env_if_possible(dataset_id), seed=0, device="cpu")
     if policy is None:
         return model
+    assert isinstance(model.observation_space, spaces.Box) and isinstance(model.action_space, spaces.Box)
     loaded, _ = load_policy(policy, model.observation_space, model.action_space)
     assert isinstance(loaded, MLPPolicy) and loaded.activation == "relu" and loaded.normalizer is None
-    actor = model.policy.actor
+    actor: Any = model.policy.actor
     with th.no_grad():
         for linear, (weight, bias) in zip((actor.latent_pi[0], actor.latent_pi[2], actor.mu), loaded.layers, strict=True):
             linear.weight.copy_(th.from_numpy(weight.T))
@@ -93,7 +95,8 @@ def make_ways(dataset_id: str, model: OfflineDCE, seed: int) -> dict[str, Play]:
         def play() -> tuple[int, Any]:
             env.seed(seed)
             returns, lengths = evaluate_policy(model, env, n_episodes, return_episode_rewards=True)
-            return sum(lengths), (list(returns), list(lengths))
+            assert isinstance(returns, list) and isinstance(lengths, list)
+            return sum(lengths), (returns, lengths)
 
         return play
 
@@ -213,8 +216,8 @@ def report(results: dict[str, dict[str, list[Sample]]], workers: list[dict[str, 
     lines = [
         "# Evaluation",
         "",
-        f"Microseconds of processor time per environment step, one core, median (smallest to largest) of {facts['turns']} turns; "
-        f"{N_SIDE_BY_SIDE} episodes side by side, {N_IN_TURN} in turn where there is one environment. The returns of both "
+        "Microseconds of processor time per environment step, one core, median (smallest to largest) of "
+        f"{facts['turns']} turns; {N_SIDE_BY_SIDE} episodes side by side, {N_IN_TURN} in turn where there is one environment. The returns of both "
         "packages were equal to the last digit in every turn.",
         "",
         f"| environment | way | CPU us per step | wall / CPU | times `{ONE}` | of the physics |",
@@ -241,8 +244,8 @@ def report(results: dict[str, dict[str, list[Sample]]], workers: list[dict[str, 
         "",
         "## Worker processes",
         "",
-        f"{N_POLICIES} policies or more, {N_SIDE_BY_SIDE} episodes each, wall-clock time, not pinned; 0 workers is this process. "
-        f"{os.cpu_count()} cores, on which other programs may run (load averages below).",
+        f"{N_POLICIES} policies or more, {N_SIDE_BY_SIDE} episodes each, wall-clock time, not pinned; 0 workers is this "
+        f"process. {os.cpu_count()} cores, on which other programs may run (load averages below).",
         "",
         "| workers | first results after, s | steps per second afterwards |",
         "|---|---|---|",
