@@ -217,7 +217,8 @@ def report(results: dict[str, dict[str, list[Sample]]], workers: list[dict[str, 
         "# Evaluation",
         "",
         "Microseconds of processor time per environment step, one core, median (smallest to largest) of "
-        f"{facts['turns']} turns; {N_SIDE_BY_SIDE} episodes side by side, {N_IN_TURN} in turn where there is one environment. The returns of both "
+        f"{facts['turns']} turns; {N_SIDE_BY_SIDE} episodes side by side, {N_IN_TURN} in turn where there is one environment."
+        " The returns of both "
         "packages were equal to the last digit in every turn.",
         "",
         f"| environment | way | CPU us per step | wall / CPU | times `{ONE}` | of the physics |",
