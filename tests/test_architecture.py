@@ -60,9 +60,15 @@ def test_algorithms_know_neither_files_nor_commands(name: str) -> None:
     assert "pandas" not in roots(PACKAGE / name)
 
 
-def test_the_package_is_imported_without_torch() -> None:
-    """Help texts and errors about files must not wait for it."""
-    code = "import sys, sb3_dce; assert 'torch' not in sys.modules; sb3_dce.OfflineDCE; assert 'torch' in sys.modules"
+def test_the_package_is_imported_without_torch_and_adds_little_to_stable_baselines3() -> None:
+    """Help texts and errors about files must not wait for it; agents and evaluation wait for no simulator or compiler."""
+    code = (
+        "import sys, sb3_dce; assert 'torch' not in sys.modules\n"
+        "import stable_baselines3; before = set(sys.modules)\n"
+        "sb3_dce.OfflineDCE; import sb3_dce.evaluation; assert 'torch' in sys.modules\n"
+        "heavy = {'mujoco', 'torch._dynamo', 'torch._inductor', 'scipy', 'pandas', 'matplotlib', 'minari'}\n"
+        "added = heavy & set(sys.modules) - before; assert not added, added"
+    )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
 
