@@ -204,6 +204,7 @@ class BatchedRuns:
         for index, (metrics, logger) in enumerate(zip(population.read_metrics(), self._loggers, strict=True)):
             for name, value in metrics.items():
                 logger.record(f"train/{name}", value)
+            logger.record("time/total_timesteps", population.n_updates)  # a row of the file says where it belongs
             logger.dump(population.n_updates)
             if index not in self._diverged and not np.isfinite(list(metrics.values())).all():
                 self._diverged[index] = population.n_updates

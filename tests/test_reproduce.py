@@ -29,6 +29,7 @@ from sb3_dce.experiments.grid import PlannedRun, Scale, expand, load_experiment
 from sb3_dce.experiments.probe import prepare_probe
 from sb3_dce.experiments.reproduce import Request, plan_runs, reproduce, scale_of
 from sb3_dce.experiments.run import execute, is_complete, populations
+from sb3_dce.population_runs import BatchedRuns
 from sb3_dce.runs import RunSpec, read_divergence, run
 from sb3_dce.training import load_any
 
@@ -146,6 +147,15 @@ def test_runs_that_can_be_batched_are_one_population(tmp_path: Path) -> None:
     assert sorted((group[0].algo, len(group)) for group in groups) == [("dce", 14), ("offline_bc", 2), ("offline_sac", 2)]
     mixed = populations(run.spec for run in small_plan("fig-cql-q", tmp_path))
     assert sorted(len(group) for group in mixed) == [1, 1, 4], "another source of the penalty's actions is another update"
+
+
+def test_population_of_a_figure_writes_what_its_processes_would_write(tmp_path: Path) -> None:
+    plan = small_plan("fig-beta", tmp_path, updates=4)
+    group = max(populations(r.spec for r in plan), key=len)
+    BatchedRuns(group, th.device("cpu"), "eager", QUIET, state_file="population-of-dce.pt").run()
+    rows = results.planned_rows(plan)
+    assert len(group) == 7 and results.done_keys(rows) == {r.key for r in plan if r.spec.algo == "dce"}
+    assert {"q_data", "gap_td", "score", "seconds"} <= set(rows["metric"])
 
 
 # -- the probe -----------------------------------------------------------------------------------------------------
