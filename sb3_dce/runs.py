@@ -289,13 +289,14 @@ def _seconds_before(folder: Path) -> float:
     return total
 
 
-def write_config(spec: RunSpec, model: OfflineAlgorithm, folder: Path) -> None:
+def write_config(spec: RunSpec, model: OfflineAlgorithm, folder: Path, device: str | None = None) -> None:
     """
     Write ``config.yml``: what is run, on which data, with which versions on what kind of machine.
 
     :param spec: what is run
     :param model: its model, with the data attached
     :param folder: where it is written
+    :param device: where it is trained, in words; ``None`` for the model's own
     """
     assert model.dataset is not None
     path, _ = find_file(model.dataset)
@@ -311,7 +312,7 @@ def write_config(spec: RunSpec, model: OfflineAlgorithm, folder: Path) -> None:
             "python": platform.python_version(),
             **{name: version(name) for name in ("torch", "stable-baselines3", "gymnasium", "mujoco", "numpy")},
         },
-        "machine": {"processor": platform.machine(), "device": str(model.device), "threads": th.get_num_threads()},
+        "machine": {"processor": platform.machine(), "device": device or str(model.device), "threads": th.get_num_threads()},
     }
     _write_text(folder / "config.yml", yaml.safe_dump(config, sort_keys=False))
 

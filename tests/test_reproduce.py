@@ -156,6 +156,7 @@ def test_population_of_a_figure_writes_what_its_processes_would_write(tmp_path: 
     rows = results.planned_rows(plan)
     assert len(group) == 7 and results.done_keys(rows) == {r.key for r in plan if r.spec.algo == "dce"}
     assert {"q_data", "gap_td", "score", "seconds"} <= set(rows["metric"])
+    assert set(rows["device"]) == {"cpu, population of 7"}
 
 
 # -- the probe -----------------------------------------------------------------------------------------------------

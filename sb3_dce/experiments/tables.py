@@ -244,13 +244,13 @@ def seconds_per_1000(evidence: Evidence, variant: Variant, dataset_ids: list[str
     :param evidence: rows
     :param variant: agent
     :param dataset_ids: data
-    :return: of each complete run
+    :return: of each complete run that was trained alone; members of a population have its time together
     """
-    rates = [
-        1000.0 * evidence.last(variant, name, "seconds") / (evidence.n_updates(name) or 1)
-        for name in dataset_ids
-        if len(evidence.last(variant, name, "seconds"))
-    ]
+    rates = []
+    for name in dataset_ids:
+        rows = evidence.runs(variant, name)
+        alone = rows[(rows["metric"] == "seconds") & ~rows["device"].str.contains("population")]
+        rates.append(1000.0 * alone["value"].to_numpy(dtype=float) / alone["n_updates"].to_numpy(dtype=float))
     return np.concatenate(rates) if rates else np.empty(0)
 
 
