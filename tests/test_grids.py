@@ -11,13 +11,12 @@ from commands import sb3_dce
 
 from sb3_dce.data.locate import DATASETS_VARIABLE
 from sb3_dce.errors import ConfigError, DatasetNotFoundError
+from sb3_dce.experiments.configuration import config_hash, differences
 from sb3_dce.experiments.grid import (
     EMBEDDED,
     SCALES,
     PlannedRun,
     Variant,
-    config_hash,
-    differences,
     expand,
     experiment_ids,
     load_experiment,

@@ -14,7 +14,8 @@ import numpy as np
 import pandas as pd
 
 from sb3_dce.data.catalog import resolve
-from sb3_dce.experiments.grid import EMBEDDED, Experiment, GridDataset, Scale, Variant, row_of, source_of, variant_hash
+from sb3_dce.experiments.configuration import row_of
+from sb3_dce.experiments.grid import EMBEDDED, Experiment, GridDataset, Scale, Variant, source_of, variant_hash
 from sb3_dce.theory import beta_eff, shift_factor
 
 UPDATES_PER_EPOCH = 1000

@@ -8,7 +8,6 @@ a run in common share it.
 
 from __future__ import annotations
 
-import hashlib
 import inspect
 import json
 from collections.abc import Iterable, Sequence
@@ -25,14 +24,11 @@ from sb3_dce.agents import agent_class
 from sb3_dce.data.catalog import resolve
 from sb3_dce.data.locate import search
 from sb3_dce.errors import ConfigError, DatasetNotFoundError
+from sb3_dce.experiments.configuration import config_hash, defaults_of, differences, row_of
 from sb3_dce.runs import RunSpec
 
 SCALES = ("smoke", "cpu", "full")
 EMBEDDED = "halfcheetah-tiny-sb3"
-# Parameters that say where and how fast an agent is trained, or that have a column of their own; they make no other run.
-NOT_HYPERPARAMETERS = frozenset(
-    {"dataset", "seed", "policy", "device", "execution", "verbose", "tensorboard_log", "stats_window_size", "gradient_steps"}
-)
 
 
 @dataclass(frozen=True)
@@ -276,34 +272,6 @@ def expand(
     return planned
 
 
-def differences(algo: str, dataset_id: str | None, overrides: dict[str, Any]) -> str:
-    """
-    Hyperparameters of a run as a text that is the same however the run was asked for.
-
-    :param algo: name of the agent
-    :param dataset_id: id of the catalogue, whose row of the hyperparameter file applies
-    :param overrides: constructor arguments that replace those of the row
-    :return: JSON of those that differ from the row and, where it is silent, from the constructor's defaults
-    """
-    in_force = {**_defaults(algo), **row_of(algo, dataset_id)}
-    return _json({k: v for k, v in overrides.items() if k not in NOT_HYPERPARAMETERS and in_force.get(k) != v})
-
-
-def config_hash(algo: str, hyperparameters: dict[str, Any]) -> str:
-    """
-    What a run is apart from data, seed and length. A parameter that is added later, with a default that changes nothing,
-    leaves it as it is; a changed row of a hyperparameter file does not.
-
-    :param algo: name of the agent
-    :param hyperparameters: constructor arguments in force
-    :return: 12 hexadecimal digits, of those that differ from the constructor's defaults
-    """
-    defaults = _defaults(algo)
-    counted = {k: v for k, v in hyperparameters.items() if k in defaults and k not in NOT_HYPERPARAMETERS}
-    differing = {k: v for k, v in counted.items() if v != defaults[k] and not (k == "policy_kwargs" and not v)}
-    return hashlib.sha256(f"{algo} {_json(differing)}".encode()).hexdigest()[:12]
-
-
 def variant_hash(variant: Variant, dataset_id: str, scale: Scale | None = None) -> str:
     """
     :param variant: of a grid
@@ -312,22 +280,7 @@ def variant_hash(variant: Variant, dataset_id: str, scale: Scale | None = None) 
     :return: hash of the run's configuration, as it stands in the rows
     """
     row = row_of(variant.algo, dataset_id)
-    return config_hash(variant.algo, {**_defaults(variant.algo), **row, **_overrides(variant, scale)})
-
-
-@cache
-def row_of(algo: str, dataset_id: str | None) -> dict[str, Any]:
-    """
-    :param algo: name of the agent
-    :param dataset_id: id of the catalogue
-    :return: constructor arguments of the row that applies, not to be changed; the files are read once
-    """
-    return hyperparams.split_row(hyperparams.load_row(algo, dataset_id)).kwargs
-
-
-@cache
-def _defaults(algo: str) -> dict[str, Any]:
-    return {name: p.default for name, p in inspect.signature(agent_class(algo)).parameters.items() if name[0] != "_"}
+    return config_hash(variant.algo, {**defaults_of(variant.algo), **row, **_overrides(variant, scale)})
 
 
 def source_of(dataset_id: str) -> str:
@@ -410,21 +363,6 @@ def present_datasets(experiment: Experiment, scale: Scale) -> list[str]:
         if file_id is not None:
             found.append(dataset.paper)
     return found
-
-
-def _json(values: dict[str, Any]) -> str:
-    return json.dumps(_plain_numbers(values), sort_keys=True, separators=(",", ":"))
-
-
-def _plain_numbers(value: Any) -> Any:
-    """2 and 2.0 are the same hyperparameter."""
-    if isinstance(value, dict):
-        return {key: _plain_numbers(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain_numbers(item) for item in value]
-    if isinstance(value, float) and value.is_integer():
-        return int(value)
-    return value
 
 
 def _tuples(entry: dict[str, Any]) -> dict[str, Any]:

@@ -8,8 +8,9 @@ import numpy as np
 
 from sb3_dce.dce import OfflineDCE
 from sb3_dce.experiments import diagnosis, tables
+from sb3_dce.experiments.configuration import row_of
 from sb3_dce.experiments.evidence import Evidence
-from sb3_dce.experiments.grid import row_of, source_of
+from sb3_dce.experiments.grid import source_of
 from sb3_dce.experiments.paper import paper_score, read_csv
 from sb3_dce.experiments.statistics import bootstrap_interval
 from sb3_dce.experiments.tables import TextTable

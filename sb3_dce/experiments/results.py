@@ -22,7 +22,8 @@ from sb3_dce.data.catalog import resolve
 from sb3_dce.data.locate import short_name
 from sb3_dce.errors import CheckpointError, SB3DCEError
 from sb3_dce.evaluation import catalogue_id, read_evaluations
-from sb3_dce.experiments.grid import PlannedRun, config_hash, differences
+from sb3_dce.experiments.configuration import config_hash, differences
+from sb3_dce.experiments.grid import PlannedRun
 from sb3_dce.files import write_atomically
 from sb3_dce.runs import read_config, read_divergence, read_result
 

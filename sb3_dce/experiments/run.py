@@ -14,7 +14,8 @@ from stable_baselines3.common.utils import get_device
 from sb3_dce.agents import agent_class
 from sb3_dce.data.catalog import resolve
 from sb3_dce.errors import DivergenceError
-from sb3_dce.experiments.grid import PlannedRun, row_of
+from sb3_dce.experiments.configuration import row_of
+from sb3_dce.experiments.grid import PlannedRun
 from sb3_dce.experiments.probe import prepare_probe
 from sb3_dce.launch import launch_all
 from sb3_dce.population import SCALARS
