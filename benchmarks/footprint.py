@@ -53,6 +53,26 @@ def first_update(folder: Path) -> Measured:
     return {**named("sb3", sb3), **named("first_update", timed(train))}
 
 
+def first_online_update(folder: Path) -> Measured:
+    """The same for SAC of Stable-Baselines3 with a single transition, so without reading data."""
+    sb3 = timed(lambda: __import__("stable_baselines3"))
+    env = make_env()
+
+    def train() -> None:
+        import numpy as np
+        from stable_baselines3 import SAC
+        from stable_baselines3.common.logger import Logger
+
+        model = SAC("MlpPolicy", env, buffer_size=1, seed=0, device="cpu")
+        obs, actions = np.zeros((1, OBS_DIM)), np.zeros((1, ACT_DIM))
+        assert model.replay_buffer is not None
+        model.replay_buffer.add(obs, obs, actions, np.zeros(1), np.zeros(1), [{}])
+        model.set_logger(Logger(None, []))
+        model.train(1, 256)
+
+    return {**named("sb3", sb3), **named("first_update", timed(train))}
+
+
 def offline(folder: Path) -> Measured:
     """An agent with its data: resident memory before and after, and the file it saves."""
     from sb3_dce import OfflineDCE
@@ -122,6 +142,7 @@ def make_env() -> Any:
 WAYS: dict[str, Callable[[Path], Measured]] = {
     "import": import_package,
     "first update": first_update,
+    "first online update": first_online_update,
     "offline": offline,
     "online": online,
     "worker": worker,
@@ -190,8 +211,12 @@ def report(results: dict[str, list[Measured]], facts: dict[str, Any]) -> str:
         f"| `import stable_baselines3` | {seconds('import', 'sb3')} | |",
         f"| `import sb3_dce` after it | {seconds('import', 'package')} | {IMPORT_AIM} |",
         f"| `sb3_dce.OfflineDCE` after that | {seconds('import', 'agent')} | |",
-        "| from there on: import, model, reading and checking the file, one eager update | "
+        "| after importing Stable-Baselines3: `OfflineDCE` imported and made, the file read and checked, one eager update | "
         f"{seconds('first update', 'first_update')} | {FIRST_UPDATE_AIM} |",
+        "| the same with SAC of Stable-Baselines3 and a single transition | "
+        f"{seconds('first online update', 'first_update')} | |",
+        "",
+        "Most of a first update is PyTorch's: the first optimizer of a process imports its compiler, for SAC as well.",
         "",
         "| | OfflineDCE | SAC of Stable-Baselines3 |",
         "|---|---|---|",
