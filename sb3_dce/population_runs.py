@@ -153,6 +153,8 @@ class BatchedRuns:
                 models = population.commit()
                 if population.n_updates % self.eval_freq == 0:
                     self._evaluate(models, population.n_updates)
+                else:  # the end: the checkpoint that could be evaluated again is about to go
+                    self._collect_evaluations()
                 self._save(population, time.monotonic() - started)
         self._collect_evaluations()
         return self._finish(population, time.monotonic() - started)
@@ -251,9 +253,9 @@ class BatchedRuns:
     def _save(self, population: Population, seconds: float) -> None:
         """All members, then the file that says so; what is older goes last. A kill at any point leaves a whole set."""
         n = population.n_updates
-        for index, (model, folder) in enumerate(zip(population.models, self.folders, strict=True)):
+        for model, folder in zip(population.models, self.folders, strict=True):
             model.num_timesteps = n
-            if index not in self._diverged:
+            if not self._diverged:
                 model.save(folder / _checkpoint(n))
         if self._diverged:
             return  # a member that cannot be saved cannot be resumed: the last whole set stays

@@ -17,6 +17,8 @@ from update_tools import all_tensors, largest_difference
 
 from sb3_dce import OfflineDCE
 from sb3_dce.errors import ConfigError, DivergenceError
+from sb3_dce.evaluation import read_evaluations
+from sb3_dce.evaluation_pool import EvaluationPool
 from sb3_dce.population_runs import STATE_FILE, BatchedRuns, train_population
 from sb3_dce.runs import RunSpec, read_divergence, run
 
@@ -91,6 +93,36 @@ def test_members_that_diverge_are_named_and_the_others_finish(tmp_path: Path) ->
         BatchedRuns(members, CPU, "eager", Console(quiet=True)).run()
     assert (tmp_path / "seed_0" / "result.json").exists() and not (tmp_path / "seed_1" / "result.json").exists()
     assert read_divergence(tmp_path / "seed_0") is None and read_divergence(tmp_path / "seed_1") is not None
+
+
+def test_nothing_is_saved_that_could_not_be_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    members = specs(tmp_path)
+    members[1].overrides["learning_rate"] = 1e30
+    monkeypatch.setattr(BatchedRuns, "_finish", lambda *_: [])
+    BatchedRuns(members, CPU, "eager", Console(quiet=True)).run()
+    assert not list(tmp_path.glob("*/checkpoint_*.zip"))
+
+
+def test_evaluation_in_a_worker_is_kept_if_the_run_is_killed_at_its_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    submit, save = EvaluationPool.submit, BatchedRuns._save
+
+    def beside(self: EvaluationPool, model: Any, rollouts: Any, seed: int, parts: int = 1) -> Any:
+        return submit(EvaluationPool(0), model, rollouts, seed)
+
+    def killed(self: BatchedRuns, population: Any, seconds: float) -> None:
+        save(self, population, seconds)
+        if population.n_updates == 50:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(EvaluationPool, "submit", beside)
+    with monkeypatch.context() as patch:
+        patch.setattr(BatchedRuns, "_save", killed)
+        with pytest.raises(KeyboardInterrupt):
+            BatchedRuns(specs(tmp_path, n_updates=50), CPU, "eager", Console(quiet=True), workers=1).run()
+    BatchedRuns(specs(tmp_path, n_updates=50), CPU, "eager", Console(quiet=True), workers=1).run()
+    assert [e.n_updates for e in read_evaluations(tmp_path / "seed_0", None)] == [20, 40]
 
 
 def test_two_populations_share_a_folder_by_names_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
