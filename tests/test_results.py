@@ -81,6 +81,14 @@ def test_run_that_diverged_is_a_result(finished: Path, tmp_path: Path) -> None:
     assert "seconds" not in set(rows["metric"])
 
 
+def test_run_that_is_being_made_longer_keeps_its_rows(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    (folder / "progress_12.csv").write_text("time/total_timesteps,train/q_data\n16,1e9\n")
+    before, after = (results.rows_of_run(path, "table1") for path in (finished, folder))
+    assert before is not None and after is not None and before.equals(after)
+
+
 def test_log_of_a_run_that_was_killed_counts_each_step_once(tmp_path: Path) -> None:
     # killed after step 30, resumed from the checkpoint at 20, with a last line cut in the middle
     (tmp_path / "progress_0.csv").write_text("time/total_timesteps,train/q_data\n10,1.0\n20,2.0\n30,99.0\n")

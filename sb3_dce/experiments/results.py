@@ -269,6 +269,7 @@ def _evaluations(folder: Path, dataset_id: str | None, n_updates: int) -> list[t
 def _curves(folder: Path, n_updates: int, eval_freq: int) -> list[tuple[int, str, float]]:
     """Diagnostics of the log, averaged over intervals of at least ``eval_freq`` steps."""
     log = read_log(folder)
+    log = log[log.index <= n_updates]  # a complete run may be on its way to become a longer one
     if log.empty:
         return []
     width = max(eval_freq, -(-n_updates // POINTS))
