@@ -14,7 +14,7 @@ from sb3_dce.experiments import results
 from sb3_dce.experiments.claims import own_table_facts
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.figures import panel_curves
-from sb3_dce.experiments.grid import experiment_ids, load_experiment
+from sb3_dce.experiments.grid import experiment_ids, load_experiment, variant_hash
 from sb3_dce.experiments.reports import config_table, make_report, toy_table
 from sb3_dce.experiments.tables import TextTable, aggregate_tables, score_table
 from sb3_dce.experiments.verdicts import HELD, NOT_HELD, UNTESTED, verdicts
@@ -162,6 +162,25 @@ def test_claims_on_beta_fail_on_rows_that_break_them(change: dict[str, object], 
     judged = verdicts(evidence_of(beta_rows(**change), "fig-beta"))  # type: ignore[arg-type]
     (verdict,) = [v for v in judged if claim in v.claim]
     assert verdict.outcome == NOT_HELD
+
+
+def test_claims_on_places_are_not_tested_on_d4rl_and_own_data_together() -> None:
+    own = [f"halfcheetah-{kind}-sb3" for kind in ("random", "medium", "medium-replay", "medium-expert")]
+    both = ["halfcheetah-random-v2", "halfcheetah-medium-v2", *own[:2]]
+    outcomes = []
+    for names in (both, own):
+        rows = table_rows(TABLE, {name: scores(DCE=[90.0]) for name in names})
+        (verdict,) = [v for v in verdicts(evidence_of(rows)) if v.claim.startswith("C4")]
+        outcomes.append(verdict.outcome)
+    assert outcomes == [UNTESTED, HELD]
+
+
+def test_end_of_runs_that_have_diverged_is_not_claimed() -> None:
+    rows = beta_rows()
+    lost = (rows["step"] > 50_000) & (rows["config_hash"] == variant_hash(BETA.variant("beta 0"), CHEETAH))
+    evidence = evidence_of(rows[~lost], "fig-beta", 100_000)
+    assert evidence.tail(BETA.variant("beta 0"), CHEETAH, "q_data") is None
+    assert {v.outcome for v in verdicts(evidence) if "In-data Q falls" in v.claim} == {UNTESTED}
 
 
 @pytest.mark.parametrize("name", [n for n in experiment_ids() if n not in ("bounds", "config-tables")])

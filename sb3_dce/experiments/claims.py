@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.paper import gym_rows, leaders, paper_score, paper_scores, paper_total
 from sb3_dce.experiments.statistics import sample_std
@@ -98,7 +100,7 @@ def _faster_than_cql(evidence: Evidence | None) -> Verdict:
     if evidence is not None:
         ids = [name for _, name in evidence.table_rows()]
         found = {name: seconds_per_1000(evidence, evidence.experiment.variant(name), ids) for name in ("DCE", "CQL")}
-        rates = {name: sorted(values)[len(values) // 2] for name, values in found.items() if len(values)}
+        rates = {name: float(np.median(values)) for name, values in found.items() if len(values)}
     numbers = ", ".join(f"{name} {value:.1f} s per 1000 updates" for name, value in rates.items())
     holds = rates["DCE"] < rates["CQL"] if len(rates) == 2 else None
     return judge("DCE is faster than CQL", "medians of the run times", holds, numbers)

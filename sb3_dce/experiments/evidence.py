@@ -180,14 +180,19 @@ class Evidence:
         :param dataset_id: data
         :param metric: name
         :param share: of the run that counts, from its end
-        :return: mean over this part and over seeds; ``None`` without values
+        :return: mean over this part and over seeds; ``None`` without values in it, as when all runs diverged before
         """
-        curve = self.curve(variant, dataset_id, metric)
-        if curve.empty:
-            return None
-        n = self.n_updates(dataset_id) or 0
-        late = curve[curve.index > (1.0 - share) * n]
-        return float(np.nanmean((late if len(late) else curve.tail(1)).to_numpy()))
+        return self.tail_mean(self.curve(variant, dataset_id, metric), dataset_id, share)
+
+    def tail_mean(self, curve: pd.DataFrame, dataset_id: str, share: float = 0.1) -> float | None:
+        """
+        :param curve: one column per seed, indexed by gradient steps
+        :param dataset_id: data of its runs
+        :param share: of the run that counts, from its end
+        :return: as :meth:`tail`
+        """
+        late = curve[curve.index > (1.0 - share) * (self.n_updates(dataset_id) or 0)]
+        return float(np.nanmean(late.to_numpy())) if late.notna().any(axis=None) else None
 
     # -- theory ----------------------------------------------------------------------------------------------------
 

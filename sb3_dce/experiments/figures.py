@@ -56,7 +56,7 @@ def draw(evidence: Evidence, folder: Path, name: str) -> list[Path]:
 
 def draw_profile(evidence: Evidence, source: str, folder: Path, name: str) -> list[Path]:
     """
-    Performance profile: the share of runs with at least a given score, over the data on which all agents have runs.
+    Performance profile: the share of runs above a score, over the data on which all agents have runs.
 
     :param evidence: of a table
     :param source: "D4RL" or "sb3", never both

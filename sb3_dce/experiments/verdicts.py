@@ -14,6 +14,7 @@ import numpy as np
 from sb3_dce.dce_probe import PROBE_BETAS
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.figures import probe_difference
+from sb3_dce.experiments.grid import source_of
 from sb3_dce.experiments.tables import seconds_per_1000
 
 HELD, NOT_HELD, UNTESTED = "held", "did not hold", "could not be tested"
@@ -176,12 +177,13 @@ def _ood(evidence: Evidence) -> list[Verdict]:
     ):
         values: dict[str, float] | None = {}
         for beta in betas:
-            curve = None if dataset_id is None else probe_difference(evidence, probe, dataset_id, metric, beta)
-            if curve is None or curve.empty or values is None:
+            value = None
+            if dataset_id is not None:
+                value = evidence.tail_mean(probe_difference(evidence, probe, dataset_id, metric, beta), dataset_id)
+            if value is None or values is None:
                 values = None
                 continue
-            late = curve[curve.index > 0.9 * (evidence.n_updates(dataset_id or "") or 0)]
-            values[f"beta {beta}"] = float(late.mean().mean())
+            values[f"beta {beta}"] = value
         found.append(judge(text, f"ordered by beta ({TENTH})", _falling(values), _text(values)))
     return found
 
@@ -311,27 +313,29 @@ def _leading(evidence: Evidence) -> list[Verdict]:
     }
     found = []
     for claim, (task, endings) in kinds.items():
-        places = {}
+        wanted = [d.paper for d in evidence.experiment.datasets if _is_of_kind(d.paper, task, endings)]
+        by_source: dict[str, dict[str, float]] = {"D4RL": {}, "sb3": {}}
         for dataset, name in evidence.table_rows():
-            kind = dataset.paper.removesuffix("-v2").partition("-")[2]
             means = {
                 v.name: float(evidence.last(v, name).mean())
                 for v in evidence.experiment.variants
                 if v.paper is not None and len(evidence.last(v, name))
             }
-            if dataset.paper.startswith(task) and kind in endings and "DCE" in means and len(means) > 1:
-                places[name] = 1 + sum(value > means["DCE"] for value in means.values())
-        wanted = sum(d.paper.startswith(task) and d.paper.removesuffix("-v2").partition("-")[2] in endings
-                     for d in evidence.experiment.datasets)  # fmt: skip
+            if dataset.paper in wanted and "DCE" in means and len(means) > 1:
+                by_source[source_of(name)][name] = 1 + sum(value > means["DCE"] for value in means.values())
+        # the paper's own data if they are all there; never some of these and some of ours
+        places = by_source["D4RL"] if len(by_source["D4RL"]) >= len(by_source["sb3"]) else by_source["sb3"]
         first = sum(place == 1 for place in places.values())
         holds = None
-        if len(places) >= max(1, wanted):
+        if wanted and len(places) == len(wanted):
             holds = first == 0 if claim.startswith("C6") else first == len(places)
-        rule = "DCE's mean is the highest of the agents that were run" + (
-            " nowhere" if claim.startswith("C6") else " everywhere"
-        )
-        found.append(judge(claim, rule, holds, f"place of DCE: {_text({k: float(v) for k, v in places.items()}, 0)}"))
+        rule = f"DCE's mean is the highest of the agents that were run {'nowhere' if claim.startswith('C6') else 'everywhere'}"
+        found.append(judge(claim, rule, holds, f"place of DCE: {_text(places, 0)}"))
     return found
+
+
+def _is_of_kind(paper: str, task: str, endings: tuple[str, ...]) -> bool:
+    return paper.startswith(task) and paper.removesuffix("-v2").partition("-")[2] in endings
 
 
 def _adroit(evidence: Evidence) -> list[Verdict]:
