@@ -92,6 +92,14 @@ def test_parts_of_a_grid_are_chosen_by_agent_and_seed(tmp_path: Path) -> None:
     assert {(r.spec.n_updates, r.spec.eval_freq) for r in planned} == {(4, 2)}
 
 
+@pytest.mark.parametrize(("device", "message"), [("gpu", "must be one of 'auto', 'cpu', 'cuda'"), ("cuda", "no CUDA device")])
+def test_device_that_is_not_there_is_said(device: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(th.cuda, "is_available", lambda: False)
+    with pytest.raises(ConfigError, match=message):
+        reproduce(Request(("fig-beta",), "smoke", tmp_path / "out", device=device), QUIET)
+    assert not (tmp_path / "out").exists()
+
+
 def test_runs_of_other_commands_become_rows_without_training(tmp_path: Path) -> None:
     run(RunSpec("dce", TINY, 5, 4, str(tmp_path / "compare" / "dce" / "seed_5"), 2, 1, QUICK))
     arguments = ("--report-only", "--out", str(tmp_path / "out"))

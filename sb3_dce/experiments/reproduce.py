@@ -9,9 +9,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pandas as pd
+import torch as th
 from rich.console import Console
 from rich.table import Table
 
+from sb3_dce.checks import check_choice
 from sb3_dce.data.locking import exclusive
 from sb3_dce.errors import ConfigError
 from sb3_dce.experiments import results
@@ -32,6 +34,7 @@ from sb3_dce.experiments.reports import Report, count, make_report
 from sb3_dce.experiments.run import execute, is_complete
 from sb3_dce.hyperparams import did_you_mean, full_name
 
+DEVICES = ("auto", "cpu", "cuda")
 ALL = "all"
 PRESENT = "present"
 # Tables with more columns than this, and columns, for which a terminal has no room.
@@ -105,6 +108,9 @@ def reproduce(request: Request, console: Console) -> dict[str, Report]:
     if request.scale not in SCALES:
         hint = f"{did_you_mean(request.scale, SCALES)}There are {', '.join(SCALES)}."
         raise ConfigError(f"no scale {request.scale!r}", key="--scale", hint=hint)
+    check_choice("--device", request.device, DEVICES)
+    if request.device == "cuda" and not th.cuda.is_available():
+        raise ConfigError("--device cuda, but PyTorch finds no CUDA device here", key="--device", hint="Leave it out.")
     experiments = [load_experiment(name) for name in request.ids]
     scales = {e.id: scale_of(e, request) for e in experiments}
     for folder in (*request.reuse, *request.imports):
