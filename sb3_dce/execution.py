@@ -12,21 +12,19 @@ import contextlib
 import shutil
 import warnings
 from collections.abc import Callable, Hashable, Iterator
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 import torch as th
-from torch.utils._pytree import tree_leaves, tree_map
+from torch.utils._pytree import tree_leaves
 
+from sb3_dce.capture import CapturedStep, Draw, StaticInputs, Step
 from sb3_dce.errors import DivergenceError, SB3DCEWarning
+from sb3_dce.metric_sums import MetricSums
 
 # (state tree, batch, noise, coefficients) -> (new state tree, metrics), see the ``update`` of an algorithm.
 Update = Callable[..., tuple[dict[str, Any], dict[str, th.Tensor]]]
 
 Variant = tuple[tuple[str, Any], ...]
-# what draws (batch, noise) for one update
-Draw = Callable[[], tuple[Any, dict[str, th.Tensor]]]
-# update with write-back: (state, batch, noise, coefficients) -> metrics
-Step = Callable[[dict[str, Any], Any, dict[str, th.Tensor], dict[str, th.Tensor]], dict[str, th.Tensor]]
 
 EXECUTIONS = ("auto", "eager", "compile", "cudagraph")
 
@@ -78,69 +76,6 @@ class State(Protocol):
 
 
 S = TypeVar("S", bound=State)
-
-
-class MetricSums:
-    """
-    Sums of metrics on the device, read back only when a log row is due.
-
-    The tensors stay where they are from the first update on, so that a captured step can add to them.
-    """
-
-    def __init__(self) -> None:
-        self._totals: dict[tuple[str, ...], th.Tensor] = {}
-        self._counts: dict[tuple[str, ...], int] = {}
-
-    def add(self, metrics: dict[str, th.Tensor]) -> None:
-        """
-        :param metrics: of one update, each 0-dimensional, or of shape (models,)
-        """
-        self.count(self.accumulate(metrics))
-
-    def accumulate(self, metrics: dict[str, th.Tensor]) -> tuple[str, ...]:
-        """
-        Add on the device only; what a captured step does.
-
-        :param metrics: of one update, each 0-dimensional, or of shape (models,)
-        :return: their names, for :meth:`count`
-        """
-        names = tuple(metrics)
-        values = th.stack(list(metrics.values()))
-        if names not in self._totals:
-            self._totals[names], self._counts[names] = th.zeros_like(values), 0
-        self._totals[names].add_(values)
-        return names
-
-    def count(self, names: tuple[str, ...]) -> None:
-        """
-        :param names: metrics of which one more update has been added
-        """
-        self._counts[names] += 1
-
-    def read(self, clear: bool = True) -> dict[str, float]:
-        """
-        :param clear: start new sums
-        :return: mean of each metric since the sums were last cleared, names in the order of the updates
-        """
-        return {name: float(value) for name, value in self.read_members(clear).items()}
-
-    def read_members(self, clear: bool = True) -> dict[str, th.Tensor]:
-        """
-        :param clear: start new sums
-        :return: mean of each metric since the sums were last cleared, each of shape () or (models,), on the CPU
-        """
-        totals: dict[str, th.Tensor] = {}
-        counts: dict[str, int] = {}
-        for names, total in self._totals.items():
-            if self._counts[names] == 0:
-                continue
-            for name, value in zip(names, total.cpu().clone(), strict=True):
-                totals[name] = totals[name] + value if name in totals else value
-                counts[name] = counts.get(name, 0) + self._counts[names]
-            if clear:
-                total.zero_()
-                self._counts[names] = 0
-        return {name: totals[name] / counts[name] for name in totals}
 
 
 def refuse_divergence(means: dict[str, float], first: int, last: int) -> None:
@@ -284,101 +219,3 @@ class Engine(Generic[S]):
             return metrics
 
         return run
-
-
-class StaticInputs(NamedTuple):
-    """Buffers that a captured step reads: each call copies its batch and noise there."""
-
-    batch: Any
-    noise: dict[str, th.Tensor]
-
-    @classmethod
-    def like(cls, batch: Any, noise: dict[str, th.Tensor]) -> StaticInputs:
-        """
-        :param batch: replay data
-        :param noise: random numbers
-        :return: buffers with their shapes and values
-        """
-        return cls(*tree_map(lambda leaf: leaf.clone() if isinstance(leaf, th.Tensor) else leaf, (batch, noise)))
-
-    def fits(self, batch: Any) -> bool:
-        """
-        :param batch: replay data
-        :return: whether it has the shapes given at first
-        """
-        pairs = zip(tree_leaves(self.batch), tree_leaves(batch), strict=True)
-        return all(old.shape == new.shape for old, new in pairs if isinstance(old, th.Tensor))
-
-    def fill(self, batch: Any, noise: dict[str, th.Tensor]) -> None:
-        """
-        :param batch: replay data of the shapes given at first
-        :param noise: random numbers of the shapes given at first
-        """
-        for old, new in zip(tree_leaves(tuple(self)), tree_leaves((batch, noise)), strict=True):
-            if isinstance(old, th.Tensor):
-                old.copy_(new)
-
-
-class CapturedStep:
-    """
-    One update as a CUDA graph. The updates that warm it up are real ones: nothing is thrown away.
-
-    :param step: update with write-back
-    :param state: tensors of the model, which must stay where they are
-    :param draw: gives batch and noise; captured, too
-    :param coef: coefficients, read at every replay from where they are now
-    :param metrics: sums that the graph adds to
-    :param generator: what ``draw`` draws with on the device; every replay goes on in its stream of numbers as eager draws do
-    """
-
-    # Compiler and libraries allocate and tune during the first calls, which a capture does not allow.
-    WARM_UP = 3
-
-    def __init__(
-        self,
-        step: Step,
-        state: Any,
-        draw: Draw,
-        coef: dict[str, th.Tensor],
-        metrics: MetricSums,
-        generator: th.Generator | None = None,
-    ) -> None:
-        self._step, self._state, self._draw, self._coef, self._metrics = step, state, draw, dict(coef), metrics
-        self._generator = generator
-        self._stream = th.cuda.Stream()
-        self._calls = 0
-        self._graph: th.cuda.CUDAGraph | None = None
-        self._names: tuple[str, ...] = ()
-
-    def reads(self, coef: dict[str, th.Tensor], generator: th.Generator | None) -> bool:
-        """
-        :param coef: coefficients
-        :param generator: source of randomness
-        :return: whether it is these that the graph reads
-        """
-        return self._generator is generator and all(coef[name] is tensor for name, tensor in self._coef.items())
-
-    def replay(self) -> None:
-        """One update."""
-        if self._graph is not None:
-            self._graph.replay()
-            self._metrics.count(self._names)
-            return
-        self._stream.wait_stream(th.cuda.current_stream())
-        with th.cuda.stream(self._stream):
-            self._run()
-        th.cuda.current_stream().wait_stream(self._stream)
-        self._metrics.count(self._names)
-        self._calls += 1
-        if self._calls == self.WARM_UP:
-            graph = th.cuda.CUDAGraph()
-            if self._generator is not None:
-                graph.register_generator_state(self._generator)
-            with th.cuda.graph(graph, stream=self._stream):  # computes nothing yet
-                self._run()
-            self._graph = graph
-
-    def _run(self) -> None:
-        batch, noise = self._draw()
-        metrics = self._step(self._state, batch, noise, self._coef)
-        self._names = self._metrics.accumulate(metrics)

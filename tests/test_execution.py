@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import warnings
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -11,8 +13,10 @@ from torch.nn import functional as F
 from update_tools import all_tensors, largest_difference, needs_compiler, record_steps, to_float64
 
 from sb3_dce import OfflineDCE, Transitions
+from sb3_dce.capture import CapturedStep, CaptureError, StaticInputs
 from sb3_dce.errors import ConfigError, SB3DCEWarning
-from sb3_dce.execution import UPDATES_WORTH_A_COMPILED_CALLER, MetricSums, StaticInputs, choose_execution
+from sb3_dce.execution import UPDATES_WORTH_A_COMPILED_CALLER, choose_execution
+from sb3_dce.metric_sums import MetricSums
 from sb3_dce.precision import RoundedLinear, _missing, _warn_once, matmul_precision
 
 CPU, CUDA = th.device("cpu"), th.device("cuda")
@@ -110,6 +114,48 @@ def test_static_inputs_take_over_values_and_keep_their_place(
     assert static.batch.observations.data_ptr() == place
     assert th.equal(static.batch.observations, second.batch.observations)
     assert th.equal(static.noise["actor"], second.noise["actor"])
+
+
+def test_capture_is_on_the_models_device_and_its_failure_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The calls of CUDA stand aside here; what they do is for ``test_gpu.py``."""
+    places: list[Any] = []
+
+    class Stream:
+        def __init__(self, device: Any = None) -> None:
+            places.append(device)
+
+        def wait_stream(self, other: Any) -> None:
+            pass
+
+    @contextlib.contextmanager
+    def at(place: Any) -> Iterator[None]:
+        places.append(place)
+        yield
+
+    @contextlib.contextmanager
+    def refusing(graph: Any, stream: Any) -> Iterator[None]:
+        yield
+        raise RuntimeError("operation not permitted when stream is capturing\nand more")
+
+    for name, stand_in in {"Stream": Stream, "device": at, "graph": refusing, "CUDAGraph": object}.items():
+        monkeypatch.setattr(th.cuda, name, stand_in)
+    monkeypatch.setattr(th.cuda, "stream", lambda stream: contextlib.nullcontext())
+    monkeypatch.setattr(th.cuda, "current_stream", Stream)
+    weights, sums = th.zeros(2), MetricSums()
+
+    def step(state: Any, batch: Any, noise: Any, coef: Any) -> dict[str, th.Tensor]:
+        state["weights"] += batch
+        return {"loss": th.ones(())}
+
+    captured = CapturedStep(step, {"weights": weights}, lambda: (th.ones(2), {}), {}, sums)
+    for _ in range(CapturedStep.WARM_UP - 1):
+        captured.replay()
+    assert weights.tolist() == [2.0, 2.0] and sums.read() == {"loss": 1.0}
+    assert places[:2] == [CPU, CPU]
+    with pytest.raises(
+        CaptureError, match=r"as a CUDA graph: operation not permitted when stream is capturing\. Use"
+    ):
+        captured.replay()
 
 
 def test_a_setting_changed_between_calls_is_seen_by_the_next_update(transitions: Transitions) -> None:
