@@ -75,6 +75,8 @@ def matmul_precision(precision: str, device: th.device) -> Iterator[None]:
 def _missing(precision: str, device: th.device) -> str | None:
     """What the device lacks, None if nothing."""
     if precision == "tf32":
+        if not hasattr(th.backends.cuda.matmul, "fp32_precision"):
+            return "PyTorch 2.9 or later"
         if device.type == "cuda" and th.cuda.get_device_capability(device) >= (8, 0):
             return None
         return f"a CUDA device of compute capability 8.0 or more, the model is on {device}"

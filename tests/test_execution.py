@@ -152,9 +152,7 @@ def test_capture_is_on_the_models_device_and_its_failure_is_said(monkeypatch: py
         captured.replay()
     assert weights.tolist() == [2.0, 2.0] and sums.read() == {"loss": 1.0}
     assert places[:2] == [CPU, CPU]
-    with pytest.raises(
-        CaptureError, match=r"as a CUDA graph: operation not permitted when stream is capturing\. Use"
-    ):
+    with pytest.raises(CaptureError, match=r"as a CUDA graph: operation not permitted when stream is capturing\. Use"):
         captured.replay()
 
 
@@ -201,6 +199,11 @@ def test_precision_is_put_back_even_after_an_error(rounds_itself: bool, monkeypa
     with matmul_precision("float32", CPU):
         assert th.backends.mkldnn.matmul.fp32_precision == before
     assert _wide_product_error() < 1e-5
+
+
+def test_tf32_is_left_out_by_a_pytorch_without_its_switch(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(th.backends.cuda, "matmul", object())
+    assert _missing("tf32", CUDA) == "PyTorch 2.9 or later"
 
 
 def _wide_product_error(width: int = 64) -> float:
