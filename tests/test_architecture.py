@@ -13,7 +13,8 @@ import sb3_dce
 
 PACKAGE = Path(sb3_dce.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
-ALGORITHMS = ("dce.py", "dce_variants.py", "bc.py", "td3_bc.py", "iql.py", "sac.py", "cql.py", "pbrl.py", "uwac.py")
+ALGORITHMS = ("dce.py", "dce_variants.py", "dce_probe.py", "bc.py", "td3_bc.py", "iql.py", "sac.py", "cql.py", "pbrl.py")
+ALGORITHMS += ("uwac.py",)
 
 
 def imported(path: Path) -> set[str]:

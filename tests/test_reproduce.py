@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import weakref
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -23,8 +24,9 @@ from sb3_dce import OfflineDCE
 from sb3_dce.data import write_hdf5
 from sb3_dce.data.locate import DATASETS_VARIABLE
 from sb3_dce.dce_probe import PROBE_BETAS, OfflineDCEProbe
-from sb3_dce.errors import ConfigError
+from sb3_dce.errors import ConfigError, DivergenceError
 from sb3_dce.experiments import results
+from sb3_dce.experiments import run as experiment_run
 from sb3_dce.experiments.grid import PlannedRun, Scale, expand, load_experiment
 from sb3_dce.experiments.probe import prepare_probe
 from sb3_dce.experiments.reproduce import Request, plan_runs, reproduce, scale_of
@@ -155,6 +157,25 @@ def test_runs_that_can_be_batched_are_one_population(tmp_path: Path) -> None:
     assert sorted((group[0].algo, len(group)) for group in groups) == [("dce", 14), ("offline_bc", 2), ("offline_sac", 2)]
     mixed = populations(run.spec for run in small_plan("fig-cql-q", tmp_path))
     assert sorted(len(group) for group in mixed) == [1, 1, 4], "another source of the penalty's actions is another update"
+
+
+def test_population_that_diverged_is_not_kept_while_others_are_trained(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class OnTheDevice:
+        pass
+
+    alive: list[weakref.ref[OnTheDevice]] = []
+
+    def diverge(group: list[RunSpec], device: th.device, console: Console) -> None:
+        assert all(earlier() is None for earlier in alive)
+        tensors = OnTheDevice()
+        alive.append(weakref.ref(tensors))
+        raise DivergenceError("1 of 2 members diverged")
+
+    monkeypatch.setattr(experiment_run, "_train_group", diverge)
+    monkeypatch.setattr(experiment_run, "get_device", th.device)
+    assert len(train(small_plan("fig-sac", tmp_path), device="cuda")) == len(alive) > 1
 
 
 def test_population_of_a_figure_writes_what_its_processes_would_write(tmp_path: Path) -> None:

@@ -91,6 +91,9 @@ def _run_all(
     for group in populations(specs):
         try:
             _train_group(group, device, console)
+        except DivergenceError as error:
+            # its traceback would keep the whole population on the device while the next ones are trained
+            failures.append(error.with_traceback(None))
         except Exception as error:
             failures.append(error)
     return failures
