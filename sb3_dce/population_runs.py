@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +72,7 @@ def train_population(
     console = console or Console(quiet=True)
     device = get_device(device)
     if device.type == "cpu":
-        return launch(specs, workers or 1, console)
+        return launch([replace(spec, device="cpu") for spec in specs], workers or 1, console)
     workers = max(1, (os.cpu_count() or 1) - 1) if workers is None else workers
     return BatchedRuns(specs, device, execution, console, state_file=state_file, workers=workers).run()
 
@@ -173,7 +174,7 @@ class BatchedRuns:
         models: list[OfflineAlgorithm] = []
         for spec, folder in zip(self.specs, self.folders, strict=True):
             if saved is None:
-                model = agent.load_dataset(spec.dataset, seed=spec.seed, device="cpu", **spec.overrides)
+                model = agent.load_dataset(spec.dataset, seed=spec.seed, **{**spec.overrides, "device": "cpu"})
                 model.num_timesteps = 0
             else:
                 model = agent.load(folder / _checkpoint(saved["n_updates"]), device="cpu")

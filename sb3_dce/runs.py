@@ -49,6 +49,7 @@ class RunSpec:
     :param n_eval_episodes: episodes of each evaluation
     :param overrides: constructor arguments that replace those of the dataset's row
     :param label: name for displays; empty for agent and seed
+    :param device: where it is trained, "auto", "cpu" or "cuda"; recorded, but no setting of the run
     """
 
     algo: str
@@ -60,6 +61,7 @@ class RunSpec:
     n_eval_episodes: int = 10
     overrides: dict[str, Any] = field(default_factory=dict)
     label: str = ""
+    device: str = "auto"
 
     @property
     def name(self) -> str:
@@ -208,7 +210,7 @@ def source_commit() -> str | None:
 
 
 def _config(spec: RunSpec) -> dict[str, Any]:
-    return {key: value for key, value in asdict(spec).items() if key not in ("folder", "label")}
+    return {key: value for key, value in asdict(spec).items() if key not in ("folder", "label", "device")}
 
 
 def refuse_other_run(spec: RunSpec, folder: Path) -> None:
@@ -264,13 +266,13 @@ def _read(path: Path, parse: Callable[[str], Any]) -> dict[str, Any] | None:
 
 
 def _model(spec: RunSpec, folder: Path) -> OfflineAlgorithm:
-    agent = agent_class(spec.algo)
+    agent, device = agent_class(spec.algo), spec.overrides.get("device", spec.device)
     for name in ("checkpoint.zip", "model.zip"):  # interrupted, or complete and now made longer
         if (folder / name).is_file():
-            model = agent.load(folder / name)
+            model = agent.load(folder / name, device=device)
             model.set_dataset(spec.dataset)  # its file may have moved since
             return model
-    model = agent.load_dataset(spec.dataset, seed=spec.seed, **spec.overrides)
+    model = agent.load_dataset(spec.dataset, seed=spec.seed, **{**spec.overrides, "device": device})
     model.num_timesteps = 0
     return model
 

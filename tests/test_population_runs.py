@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -155,3 +156,30 @@ def test_memory_is_said_before_it_starts(tmp_path: Path, capsys: pytest.CaptureF
     BatchedRuns(specs(tmp_path, n_updates=20), CPU, "eager", Console(width=200)).run()
     first = capsys.readouterr().out.splitlines()[0]
     assert first.startswith("2 models of dce on cpu: data ") and "networks" in first and "MiB" in first
+
+
+def test_runs_that_are_processes_train_where_they_were_sent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    devices = []
+
+    def launched(runs: list[RunSpec], workers: int, console: Console) -> list[dict[str, Any]]:
+        devices.extend(spec.device for spec in runs)
+        return []
+
+    monkeypatch.setattr("sb3_dce.population_runs.launch", launched)
+    train_population(specs(tmp_path), device="cpu")
+    assert devices == ["cpu", "cpu"]  # not "auto", which would take a GPU
+
+
+def test_device_is_no_setting_of_a_run_and_holds_when_it_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, *_ = specs(tmp_path)
+    run(replace(first, device="cpu", n_updates=20))
+    loaded = []
+    original = OfflineDCE.load.__func__
+
+    def load(cls: Any, *args: Any, **kwargs: Any) -> Any:
+        loaded.append(kwargs["device"])
+        return original(cls, *args, **kwargs)
+
+    monkeypatch.setattr(OfflineDCE, "load", classmethod(load))
+    assert run(replace(first, device="cpu"))["n_updates"] == 40
+    assert loaded == ["cpu"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +87,8 @@ def _run_all(
 
         return run_on_cluster(specs, ray_address, console)
     if device.type == "cpu":
-        return [outcome for outcome in launch_all(specs, workers, console) if isinstance(outcome, BaseException)]
+        here = [replace(spec, device="cpu") for spec in specs]
+        return [outcome for outcome in launch_all(here, workers, console) if isinstance(outcome, BaseException)]
     failures: list[BaseException] = []
     for group in populations(specs):
         try:
