@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -218,13 +219,15 @@ def write_evaluations(folder: Path, evaluations: list[Evaluation]) -> None:
             results=[e.returns for e in evaluations],
             ep_lengths=[e.lengths for e in evaluations],
         )
-    with (folder / "evaluations.csv").open("w", newline="", encoding="utf-8") as text:
-        writer = csv.writer(text)
-        writer.writerow(["n_updates", "episodes", "mean_return", "std_return", "normalized_score", "mean_length"])
-        for e in evaluations:
-            score = "" if e.score is None else round(e.score, 4)
-            length = round(float(np.mean(e.lengths)), 2)
-            writer.writerow([e.n_updates, len(e.returns), round(e.mean, 4), round(e.std, 4), score, length])
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow(["n_updates", "episodes", "mean_return", "std_return", "normalized_score", "mean_length"])
+    for e in evaluations:
+        score = "" if e.score is None else round(e.score, 4)
+        length = round(float(np.mean(e.lengths)), 2)
+        writer.writerow([e.n_updates, len(e.returns), round(e.mean, 4), round(e.std, 4), score, length])
+    with write_atomically(folder / "evaluations.csv") as stream:
+        stream.write(text.getvalue().encode())
 
 
 def read_evaluations(folder: Path, dataset_id: str | None) -> list[Evaluation]:

@@ -57,9 +57,13 @@ def interval_of_difference(one: np.ndarray, other: np.ndarray) -> tuple[float, f
 
 def main() -> None:
     """Read, compare, write."""
+    if len(sys.argv) != 4 or not all("=" in text for text in sys.argv[1:3]):
+        sys.exit(__doc__)
     *sets, out = sys.argv[1:]
     (name_a, configs_a, curves_a), (name_b, configs_b, curves_b) = map(read_set, sets)
     configs = [*configs_a, *configs_b]
+    if not configs_a or not configs_b:
+        sys.exit(f"no runs in {sets[0] if not configs_a else sets[1]}")
     hashes = {config["dataset"]["sha256"] for config in configs}
     lengths = {curve[-1].n_updates for curve in (*curves_a, *curves_b)}
     if len(hashes) != 1 or len(lengths) != 1:
