@@ -14,7 +14,9 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shlex
 import statistics
+import sys
 import time
 import warnings
 from collections.abc import Callable
@@ -162,7 +164,7 @@ def report(times: dict[str, list[tuple[float, float]]], first: dict[str, float],
     reference = [cpu for _, cpu in times[SAC_NAME]]
     manner = [cpu for _, cpu in times.get(MANNER_NAME, times[SAC_NAME])]
     lines = [
-        "# Speed of updates",
+        f"# Speed of updates, {facts['precision']}",
         "",
         f"{facts['processor']}, one core; Python {facts['python']}, PyTorch {facts['torch']}, {facts['date']}. "
         f"Batch {BATCH}, observations {OBS_DIM}, actions {ACT_DIM}, {facts['rows']:,} rows of random numbers: speed only, no "
@@ -220,7 +222,7 @@ def main() -> None:
         **machine(),
         **primitives(),
         "date": time.strftime("%Y-%m-%d"),
-        "command": f"python benchmarks/speed.py --repeats {options.repeats}" + (f" --only {options.only}" if only else ""),
+        "command": shlex.join(["python", "benchmarks/speed.py", *sys.argv[1:]]),
         "rows": options.rows,
         "repeats": options.repeats,
         "precision": options.precision,
