@@ -35,11 +35,15 @@ class RoundedLinear(TorchFunctionMode):
     """
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if func is F.linear and args[0].dtype == th.float32 and min(args[1].shape) >= MIN_ROUNDED_WIDTH:
-            inputs, weight, bias = (*args, *(kwargs or {}).values(), None)[:3]
-            product = F.linear(inputs.bfloat16(), weight.bfloat16()).float()
-            return product if bias is None else product + bias
-        return func(*args, **(kwargs or {}))
+        return (_rounded_linear if func is F.linear else func)(*args, **(kwargs or {}))
+
+
+def _rounded_linear(input: th.Tensor, weight: th.Tensor, bias: th.Tensor | None = None) -> th.Tensor:
+    """Arguments as those of ``torch.nn.functional.linear``."""
+    if input.dtype != th.float32 or min(weight.shape) < MIN_ROUNDED_WIDTH:
+        return F.linear(input, weight, bias)
+    product = F.linear(input.bfloat16(), weight.bfloat16()).float()
+    return product if bias is None else product + bias
 
 
 @contextlib.contextmanager
