@@ -89,6 +89,17 @@ def compare(
     out: Annotated[
         Path | None, typer.Option(show_default=False, help="Folder of the results; default runs/compare-<dataset>.")
     ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="[AGENT.]KEY=VALUE",
+            help="Hyperparameter that replaces those of the rows, of one agent or of all that have it; repeat it.",
+        ),
+    ] = None,
+    updates_of: Annotated[
+        list[str] | None, typer.Option(metavar="AGENT=UPDATES", help="Gradient steps of one agent, e.g. pbrl=1e4; repeat it.")
+    ] = None,
 ) -> None:
     """Train several agents on one dataset and compare their last policies. The same command goes on with the rest."""
     from sb3_dce.data import find_file
@@ -98,7 +109,11 @@ def compare(
 
     names = list(_names(algos))
     n_workers = workers or os.cpu_count() or 1
-    run_comparison(dataset, names, int(updates), range(seeds), eval_freq, eval_episodes, n_workers, out, console)
+    run_comparison(
+        *(dataset, names, int(updates), range(seeds), eval_freq, eval_episodes, n_workers, out, console),
+        overrides=_parse_overrides(set_ or []),
+        updates_of=_parse_lengths(updates_of or []),
+    )
 
 
 @app.command()
@@ -137,6 +152,9 @@ def reproduce(
             "--import", show_default=False, help="Folder of runs of [b]train[/b] or [b]compare[/b] to take; repeat it."
         ),
     ] = None,
+    precision: Annotated[
+        str, typer.Option(help="Matrix products: [b]float32[/b], [b]bf16-matmul[/b] (CPU) or [b]tf32[/b] (GPU).")
+    ] = "float32",
     report_only: Annotated[bool, typer.Option("--report-only", help="Train nothing: tables and figures from rows.")] = False,
     page: Annotated[Path | None, typer.Option(show_default=False, help="Results page to write, Markdown.")] = None,
     list_: Annotated[bool, typer.Option("--list", help="Show the experiments and what each needs.")] = False,
@@ -162,6 +180,7 @@ def reproduce(
         ray_address=ray_address,
         reuse=tuple(reuse or ()),
         imports=tuple(import_ or ()),
+        precision=precision,
         report_only=report_only,
         page=page,
     )
@@ -207,6 +226,20 @@ def _parse_overrides(pairs: list[str]) -> dict[str, Any]:
                 pass
         overrides[key.strip()] = value
     return overrides
+
+
+def _parse_lengths(pairs: list[str]) -> dict[str, int]:
+    lengths = {}
+    for pair in pairs:
+        name, _, text = pair.partition("=")
+        try:
+            lengths[name] = int(float(text))
+        except (ValueError, OverflowError):
+            lengths[name] = 0
+        if not name or lengths[name] < 1:
+            hint = "For example --updates-of pbrl=1e4."
+            raise ConfigError(f"--updates-of wants AGENT=UPDATES, got {pair!r}", key="--updates-of", hint=hint)
+    return lengths
 
 
 def main() -> None:

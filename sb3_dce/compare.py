@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import csv
+import inspect
 import io
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from sb3_dce.agents import agent_class
@@ -19,12 +22,12 @@ from sb3_dce.data.locate import short_name
 from sb3_dce.errors import ConfigError
 from sb3_dce.evaluation import read_evaluations
 from sb3_dce.files import write_atomically
-from sb3_dce.hyperparams import full_name
+from sb3_dce.hyperparams import check_keys, full_name
 from sb3_dce.launch import launch
 from sb3_dce.plots import plot_learning_curves
 from sb3_dce.runs import RunSpec, read_result
 
-COLUMNS = ("agent", "seed", "n_updates", "mean_return", "normalized_score", "seconds", "seconds_per_1000")
+COLUMNS = ("agent", "seed", "n_updates", "mean_return", "normalized_score", "seconds", "seconds_per_1000", "overrides")
 
 
 class Row(NamedTuple):
@@ -37,6 +40,7 @@ class Row(NamedTuple):
     :param mean: mean over the seeds of the last evaluation, score, or return without reference values
     :param std: sample standard deviation over the seeds, NaN for one
     :param seconds_per_1000: mean training seconds of 1000 updates, evaluations included
+    :param overrides: what was set instead of the dataset's row
     """
 
     agent: str
@@ -45,6 +49,7 @@ class Row(NamedTuple):
     mean: float
     std: float
     seconds_per_1000: float
+    overrides: dict[str, Any]
 
 
 def compare(
@@ -57,6 +62,8 @@ def compare(
     workers: int,
     out: Path | None,
     console: Console,
+    overrides: Mapping[str, Any] | None = None,
+    updates_of: Mapping[str, int] | None = None,
 ) -> list[Row]:
     """
     Train every agent with every seed, each with the dataset's row of its own file; show and write the comparison.
@@ -70,8 +77,11 @@ def compare(
     :param workers: processes
     :param out: folder of the results, default ``runs/compare-<dataset>``
     :param console: where to print
+    :param overrides: constructor arguments that replace those of the rows: ``{"beta": 2.0}`` for all agents that have it,
+        ``{"dce.beta": 2.0}`` for one
+    :param updates_of: gradient steps of single agents, instead of ``n_updates``
     :return: the table
-    :raises ConfigError: for an unknown agent
+    :raises ConfigError: for an unknown agent, or a setting that none of them has
     :raises SB3DCEError: the first error of a run; what the others have done is kept and resumed by the same call
     """
     algos = [full_name(algo) for algo in algos]
@@ -79,8 +89,8 @@ def compare(
         raise ConfigError(
             f"name each agent once, got {', '.join(algos)}", key="--algos", hint="For example --algos dce,offline_bc."
         )
-    for algo in algos:
-        agent_class(algo)
+    settings = settings_of(algos, overrides or {})
+    lengths = _lengths(algos, n_updates, updates_of or {})
     path, spec = find_file(dataset)
     name = short_name(dataset)
     folder = out or Path("runs") / f"compare-{name}"
@@ -88,7 +98,10 @@ def compare(
         f"[b]{', '.join(algos)}[/b] on [b]{name}[/b] ({path}), {n_updates:,} gradient steps, seeds {list(seeds)}, last policy"
     )
     specs = [
-        RunSpec(algo, dataset, seed, n_updates, str(folder / algo / f"seed_{seed}"), eval_freq, n_eval_episodes)
+        RunSpec(
+            *(algo, dataset, seed, lengths[algo], str(folder / algo / f"seed_{seed}")),
+            *(eval_freq, n_eval_episodes, settings[algo]),
+        )
         for seed in seeds  # all agents of a seed before the next seed: an interrupted comparison is a smaller one
         for algo in algos
     ]
@@ -96,6 +109,42 @@ def compare(
     info = load_transitions(dataset).info
     level = float(info.episode_returns.mean()) if len(info.episode_returns) else None
     return summarize(folder, algos, spec, level, console)
+
+
+def settings_of(algos: Sequence[str], overrides: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """
+    :param algos: full names of agents
+    :param overrides: as in :func:`compare`
+    :return: constructor arguments that are set for each agent
+    :raises ConfigError: for an unknown agent, or a setting that none of them has
+    """
+    classes = {algo: agent_class(algo) for algo in algos}
+    settings: dict[str, dict[str, Any]] = {algo: {} for algo in algos}
+    for name, value in overrides.items():
+        prefix, _, key = name.rpartition(".")
+        if prefix:
+            algo = _one_of(algos, prefix, "--set")
+            check_keys(classes[algo], {key: value}, where="--set")
+            settings[algo][key] = value
+            continue
+        having = [algo for algo, cls in classes.items() if key in inspect.signature(cls).parameters]
+        if not having:
+            check_keys(classes[algos[0]], {key: value}, where="--set")
+        for algo in having:
+            settings[algo].setdefault(key, value)  # what is set for one agent alone counts more
+    return settings
+
+
+def _lengths(algos: Sequence[str], n_updates: int, updates_of: Mapping[str, int]) -> dict[str, int]:
+    named = {_one_of(algos, name, "--updates-of"): length for name, length in updates_of.items()}
+    return {algo: named.get(algo, n_updates) for algo in algos}
+
+
+def _one_of(algos: Sequence[str], name: str, key: str) -> str:
+    full = full_name(name)
+    if full not in algos:
+        raise ConfigError(f"{name!r} is not compared here", key=key, hint=f"Compared are {', '.join(algos)}.")
+    return full
 
 
 def summarize(
@@ -137,7 +186,8 @@ def _row(algo: str, results: list[dict[str, Any]], scored: bool) -> Row:
     known = np.array([np.nan if value is None else value for value in values], dtype=float)
     std = float(known.std(ddof=1)) if len(known) > 1 else float("nan")
     seconds = float(np.mean([1000 * r["seconds"] / r["n_updates"] for r in results]))
-    return Row(algo, len(results), results[0]["n_updates"], float(known.mean()), std, seconds)
+    overrides = results[0]["config"].get("overrides", {})
+    return Row(algo, len(results), results[0]["n_updates"], float(known.mean()), std, seconds, overrides)
 
 
 def _show(rows: list[Row], data_level: float | None, scored: bool, console: Console) -> None:
@@ -148,7 +198,8 @@ def _show(rows: list[Row], data_level: float | None, scored: bool, console: Cons
     for row in sorted(rows, key=lambda row: -row.mean):
         spread = "-" if np.isnan(row.std) else f"{row.std:.1f}"
         cells = (f"{row.mean:.1f}", spread, str(row.n_seeds), f"{row.n_updates:,}", f"{row.seconds_per_1000:.1f}")
-        table.add_row(row.agent, *cells)
+        changed = "".join(f"  {name}={value}" for name, value in row.overrides.items())
+        table.add_row(f"{row.agent}[dim]{escape(changed)}[/dim]", *cells)
     if data_level is not None:
         table.add_row("mean of the data", f"{data_level:.1f}", "", "", "", "")
     console.print(table)
@@ -162,6 +213,6 @@ def _write_csv(path: Path, results: dict[str, list[dict[str, Any]]]) -> None:
         for r in found:
             rate = round(1000 * r["seconds"] / r["n_updates"], 3)
             values = (r["n_updates"], r["mean_return"], r["normalized_score"], r["seconds"], rate)
-            writer.writerow([algo, r["config"]["seed"], *values])
+            writer.writerow([algo, r["config"]["seed"], *values, json.dumps(r["config"].get("overrides", {}))])
     with write_atomically(path) as stream:
         stream.write(text.getvalue().encode())

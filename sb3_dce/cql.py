@@ -356,7 +356,7 @@ def _repeated(obs: th.Tensor, times: int) -> th.Tensor:
 
 def _of_actions(q_values: th.Tensor, n_actions: int) -> th.Tensor:
     """Values of a repeated batch by action, shape (n_critics, n_actions, batch, 1)."""
-    return q_values.unflatten(-2, (n_actions, -1))
+    return q_values.view(*q_values.shape[:-2], n_actions, -1, 1)
 
 
 def _critic_metrics(q_data: th.Tensor, q_sampled: th.Tensor, y: th.Tensor) -> dict[str, th.Tensor]:

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from rich.console import Console
 
-from sb3_dce.compare import compare, summarize
+from sb3_dce.compare import compare, settings_of, summarize
 from sb3_dce.data import resolve
 from sb3_dce.data.catalog import normalized_score
 from sb3_dce.errors import ConfigError
@@ -35,6 +36,32 @@ def test_comparison_trains_writes_and_goes_on(tmp_path: Path) -> None:
     again = compare(*arguments, quiet)  # nothing is trained again
     assert [row[:4] for row in again] == [row[:4] for row in rows]
     assert (tmp_path / "offline_bc" / "seed_0" / "model.zip").stat().st_mtime_ns == stamp
+
+
+def test_single_agents_have_their_own_settings_and_length(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = (TINY, ["bc", "sac_v"], 4, range(1), 2, 1, 2, tmp_path)
+    settings = {"batch_size": 32, "sac_v.batch_size": 16, "tau": 0.01}
+    rows = compare(*arguments, Console(width=140), overrides=settings, updates_of={"bc": 2})
+    assert [(row.agent, row.n_updates) for row in rows] == [("offline_bc", 2), ("sac_v", 4)]
+    assert [row.overrides for row in rows] == [{"batch_size": 32}, {"batch_size": 16, "tau": 0.01}]
+    used = yaml.safe_load((tmp_path / "sac_v" / "seed_0" / "config.yml").read_text())["hyperparameters"]
+    assert (used["batch_size"], used["tau"]) == (16, 0.01)
+    assert "batch_size=16" in capsys.readouterr().out
+    with (tmp_path / "comparison.csv").open() as text:
+        assert json.loads(list(csv.DictReader(text))[1]["overrides"]) == rows[1].overrides
+
+
+def test_settings_and_lengths_of_nobody_are_refused(tmp_path: Path) -> None:
+    assert settings_of(["offline_bc", "offline_iql"], {"expectile": 0.8}) == {"offline_bc": {}, "offline_iql": {"expectile": 0.8}}
+    for overrides, message in (
+        ({"expctile": 0.8}, "no parameter 'expctile'"),
+        ({"dce.beta": 1.0}, "'dce' is not compared"),
+        ({"bc.beta": 1.0}, "OfflineBC has no parameter 'beta'"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            settings_of(["offline_bc", "offline_iql"], overrides)
+    with pytest.raises(ConfigError, match="'cql' is not compared here"):
+        compare(TINY, ["bc"], 4, range(1), 2, 1, 1, tmp_path, Console(quiet=True), updates_of={"cql": 2})
 
 
 def test_table_is_made_from_the_complete_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,8 @@ from sb3_dce.agents import agent_class
 
 # Parameters that say where and how fast an agent is trained, or that have a column of their own; they make no other run.
 NOT_HYPERPARAMETERS = frozenset(
-    {"dataset", "seed", "policy", "device", "execution", "verbose", "tensorboard_log", "stats_window_size", "gradient_steps"}
+    {"dataset", "seed", "policy", "device", "execution", "precision"}
+    | {"verbose", "tensorboard_log", "stats_window_size", "gradient_steps"}
 )
 
 

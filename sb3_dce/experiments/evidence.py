@@ -2,7 +2,8 @@
 What the rows say about an experiment: scores of a table's cells, curves of a figure's lines, and where they come from.
 
 All cells of a table row come from one file: where rows of two versions of a dataset are known, those of the one with more
-runs are taken, and the others are counted as left out. All have one length, unless the caller names one.
+runs are taken, and the others are counted as left out. All have one length; runs of an agent that has only others are
+shown as what they are (:meth:`Evidence.of_other_length`) and take part in no comparison.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ class Evidence:
         self.experiment, self.scale = experiment, scale
         self._rows, self._n_updates = rows, n_updates
         self._selected: dict[str, pd.DataFrame] = {}
+        self._others: dict[str, pd.DataFrame] = {}
         self._runs: dict[tuple[str, str], pd.DataFrame] = {}
         self.left_out = 0
 
@@ -105,6 +107,7 @@ class Evidence:
                 length = int(max(cells.index, key=lambda n: (cells[n], n)))
             taken = (found["dataset_sha256"] == sha) & (found["n_updates"] == length)
             self.left_out += int((runs["dataset_sha256"] != sha).sum())
+            self._others[dataset_id] = found[(found["dataset_sha256"] == sha) & ~taken]
             found = found[taken]
         self._selected[dataset_id] = found
         return found
@@ -121,6 +124,20 @@ class Evidence:
             wanted = variant_hash(variant, dataset_id, self.scale)
             self._runs[key] = rows[(rows["agent"] == variant.algo) & (rows["config_hash"] == wanted)]
         return self._runs[key]
+
+    def of_other_length(self, variant: Variant, dataset_id: str) -> pd.DataFrame:
+        """
+        :param variant: of the experiment
+        :param dataset_id: data
+        :return: rows of its longest runs, if it has none of the length of the others and the caller named no length
+        """
+        rows = self._of_dataset(dataset_id).iloc[:0]
+        if self._n_updates is None and not len(self.runs(variant, dataset_id)) and dataset_id in self._others:
+            rows = self._others[dataset_id]
+            wanted = variant_hash(variant, dataset_id, self.scale)
+            rows = rows[(rows["agent"] == variant.algo) & (rows["config_hash"] == wanted)]
+            rows = rows[rows["n_updates"] == rows["n_updates"].max()]
+        return rows
 
     def n_updates(self, dataset_id: str) -> int | None:
         """
@@ -139,9 +156,17 @@ class Evidence:
         :param metric: name
         :return: its value at the end of each complete run, in the order of the seeds
         """
-        rows = self.runs(variant, dataset_id)
-        rows = rows[(rows["metric"] == metric) & (rows["step"] == rows["n_updates"])]
-        return rows.sort_values("seed")["value"].to_numpy(dtype=float)
+        return _at_end(self.runs(variant, dataset_id), metric)
+
+    def last_of_other_length(self, variant: Variant, dataset_id: str) -> tuple[np.ndarray, int] | None:
+        """
+        :param variant: of the experiment
+        :param dataset_id: data
+        :return: scores at the end of the runs of :meth:`of_other_length`, and their gradient steps; ``None`` without any
+        """
+        rows = self.of_other_length(variant, dataset_id)
+        scores = _at_end(rows, "score")
+        return (scores, int(rows["n_updates"].iloc[0])) if len(scores) else None
 
     def start(self, variant: Variant, dataset_id: str, metric: str) -> float | None:
         """
@@ -257,6 +282,11 @@ class Evidence:
         text += f", {_listed(episodes)} episodes" if episodes else ""
         text += f". Code {', '.join(sorted(rows['code_version'].unique()))} on {', '.join(sorted(rows['device'].unique()))}."
         return text
+
+
+def _at_end(rows: pd.DataFrame, metric: str) -> np.ndarray:
+    rows = rows[(rows["metric"] == metric) & (rows["step"] == rows["n_updates"])]
+    return rows.sort_values("seed")["value"].to_numpy(dtype=float)
 
 
 def _commonest(values: pd.Series) -> str:

@@ -33,6 +33,8 @@ from sb3_dce.experiments.pages import write_page
 from sb3_dce.experiments.reports import Report, count, make_report
 from sb3_dce.experiments.run import execute, is_complete
 from sb3_dce.hyperparams import did_you_mean, full_name
+from sb3_dce.precision import PRECISIONS
+from sb3_dce.runs import RunSpec
 
 DEVICES = ("auto", "cpu", "cuda")
 ALL = "all"
@@ -64,6 +66,7 @@ class Request:
     :param ray_address: of a cluster
     :param reuse: folders of rows; the runs in them count as done
     :param imports: folders of runs made by other commands, taken over as rows of the first experiment
+    :param precision: of matrix products; recorded with the device, since it is no hyperparameter
     :param report_only: train nothing
     :param page: results page to write
     """
@@ -82,6 +85,7 @@ class Request:
     ray_address: str | None = None
     reuse: tuple[Path, ...] = ()
     imports: tuple[Path, ...] = ()
+    precision: str = "float32"
     report_only: bool = False
     page: Path | None = None
 
@@ -109,6 +113,7 @@ def reproduce(request: Request, console: Console) -> dict[str, Report]:
         hint = f"{did_you_mean(request.scale, SCALES)}There are {', '.join(SCALES)}."
         raise ConfigError(f"no scale {request.scale!r}", key="--scale", hint=hint)
     check_choice("--device", request.device, DEVICES)
+    check_choice("--precision", request.precision, PRECISIONS)
     if request.device == "cuda" and not th.cuda.is_available():
         raise ConfigError("--device cuda, but PyTorch finds no CUDA device here", key="--device", hint="Leave it out.")
     experiments = [load_experiment(name) for name in request.ids]
@@ -215,6 +220,8 @@ def plan_runs(experiment: Experiment, scale: Scale, request: Request) -> list[Pl
         names = present_datasets(experiment, scale)
     seeds = range(request.first_seed, request.first_seed + scale.seeds)
     planned = expand(experiment, scale, request.out / "runs", names, seeds)
+    if request.precision != "float32":
+        planned = [replace(run, spec=_with_precision(run.spec, request.precision)) for run in planned]
     if not request.agents:
         return planned
     headings = {v.name for v in experiment.variants}
@@ -224,6 +231,10 @@ def plan_runs(experiment: Experiment, scale: Scale, request: Request) -> list[Pl
         hint = f"It has {'; '.join(sorted(headings))}, or all forms of {', '.join(sorted(algos))}."
         raise ConfigError(f"{experiment.id} has no agent {unknown[0]!r}", key="--agents", hint=hint)
     return [run for run in planned if {run.variant, run.spec.algo} & wanted]
+
+
+def _with_precision(spec: RunSpec, precision: str) -> RunSpec:
+    return replace(spec, overrides={**spec.overrides, "precision": precision})
 
 
 def _say_plan(planned: list[PlannedRun], known: pd.DataFrame, scales: dict[str, Scale], console: Console) -> None:

@@ -83,7 +83,7 @@ def rows_of_run(folder: Path, experiment: str) -> pd.DataFrame | None:
             "n_updates": n_updates,
             "seed": int(run["seed"]),
             "code_version": config["versions"]["sb3_dce"] + (f"+{commit}" if commit else ""),
-            "device": str(config["machine"]["device"]),
+            "device": _device(config),
         }
         values = [*_facts(folder, config, result, divergence, n_updates), *_curves(folder, n_updates, run["eval_freq"])]
         values += _evaluations(folder, dataset_id, n_updates)
@@ -229,6 +229,11 @@ def check_rows(rows: pd.DataFrame, where: str) -> None:
             refuse(f"hyperparameters must be a JSON object, got {text[:60]!r}")
     if (rows.groupby(RUN_KEY)[["hyperparameters", "code_version"]].nunique() > 1).to_numpy().any():
         refuse("one run has two sets of hyperparameters or two code versions")
+
+
+def _device(config: dict[str, Any]) -> str:
+    precision = config["hyperparameters"].get("precision", "float32")
+    return f"{config['machine']['device']}{'' if precision == 'float32' else ' ' + precision}"
 
 
 def _facts(

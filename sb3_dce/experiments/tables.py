@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import Variant, source_of
@@ -26,7 +27,7 @@ from sb3_dce.files import write_atomically
 
 BOLD_RULE = (
     "Bold: the 95 % bootstrap interval over seeds overlaps that of the best mean of the row (with one seed: the best mean). "
-    "± is the sample standard deviation over seeds."
+    "± is the sample standard deviation over seeds. 'After n' are runs of another length than those of the row."
 )
 
 
@@ -127,14 +128,20 @@ def score_cell(evidence: Evidence, variant: Variant, dataset_id: str, best: tupl
     scores, diverged = evidence.last(variant, dataset_id), evidence.n_diverged(variant, dataset_id)
     lost = f" ({diverged} diverged)" if diverged else ""
     if not len(scores):
+        other = evidence.last_of_other_length(variant, dataset_id)
+        if other is not None:
+            return f"{_mean_and_spread(other[0])} (after {other[1]:,})"
         return lost.strip() or "-"
-    spread = f" ± {sample_std(scores):.1f}" if len(scores) > 1 else ""
-    text = f"{scores.mean():.1f}{spread}"
+    text = _mean_and_spread(scores)
     assert best is not None
     tied = len(scores) > 1 and bootstrap_interval([scores]).overlaps(best[1])
     if scores.mean() == best[0] or tied:
         text = f"**{text}**"
     return text + lost
+
+
+def _mean_and_spread(scores: np.ndarray) -> str:
+    return f"{scores.mean():.1f}" + (f" ± {sample_std(scores):.1f}" if len(scores) > 1 else "")
 
 
 def _best_interval(columns: list[np.ndarray]) -> tuple[float, Interval] | None:
@@ -248,7 +255,7 @@ def seconds_per_1000(evidence: Evidence, variant: Variant, dataset_ids: list[str
     """
     rates = []
     for name in dataset_ids:
-        rows = evidence.runs(variant, name)
+        rows = pd.concat([evidence.runs(variant, name), evidence.of_other_length(variant, name)])
         alone = rows[(rows["metric"] == "seconds") & ~rows["device"].str.contains("population")]
         rates.append(1000.0 * alone["value"].to_numpy(dtype=float) / alone["n_updates"].to_numpy(dtype=float))
     return np.concatenate(rates) if rates else np.empty(0)
