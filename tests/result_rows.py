@@ -34,7 +34,7 @@ def run_rows(
         "dataset_sha256": sha,
         "agent": chosen.algo,
         "hyperparameters": differences(chosen.algo, dataset, chosen.set),
-        "config_hash": variant_hash(chosen, dataset, scale),
+        "config_hash": variant_hash(chosen, dataset, scale or experiment.scales["cpu"]),
         "n_updates": n_updates,
         "seed": seed,
         "code_version": "0.1.0+0123456789",

@@ -52,7 +52,10 @@ def test_single_agents_have_their_own_settings_and_length(tmp_path: Path, capsys
 
 
 def test_settings_and_lengths_of_nobody_are_refused(tmp_path: Path) -> None:
-    assert settings_of(["offline_bc", "offline_iql"], {"expectile": 0.8}) == {"offline_bc": {}, "offline_iql": {"expectile": 0.8}}
+    assert settings_of(["offline_bc", "offline_iql"], {"expectile": 0.8}) == {
+        "offline_bc": {},
+        "offline_iql": {"expectile": 0.8},
+    }
     for overrides, message in (
         ({"expctile": 0.8}, "no parameter 'expctile'"),
         ({"dce.beta": 1.0}, "'dce' is not compared"),

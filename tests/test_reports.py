@@ -16,7 +16,7 @@ from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.figures import panel_curves
 from sb3_dce.experiments.grid import experiment_ids, load_experiment, variant_hash
 from sb3_dce.experiments.reports import config_table, make_report, toy_table
-from sb3_dce.experiments.tables import TextTable, aggregate_tables, score_table
+from sb3_dce.experiments.tables import TextTable, aggregate_tables, runtime_table, score_table
 from sb3_dce.experiments.verdicts import HELD, NOT_HELD, UNTESTED, verdicts
 from sb3_dce.theory import shift_factor
 
@@ -98,6 +98,24 @@ def test_a_row_has_one_length_the_one_most_agents_have() -> None:
     rows = results.merge([long, short])
     assert evidence_of(rows).last(TABLE.variant("DCE"), "walker2d-medium-sb3").tolist() == [40.0, 42.0, 44.0]
     assert evidence_of(rows, n_updates=1000).last(TABLE.variant("DCE"), "walker2d-medium-sb3").tolist() == [1.0]
+
+
+def test_agent_with_runs_of_another_length_alone_is_shown_with_it_and_compared_with_nobody() -> None:
+    others = {name: values for name, values in scores().items() if name != "PBRL"}
+    long = table_rows(TABLE, {"walker2d-medium-sb3": others}, n_updates=50_000)
+    short = table_rows(TABLE, {"walker2d-medium-sb3": {"PBRL": [90.0, 92.0]}}, n_updates=10_000, seconds=20.0)
+    evidence = evidence_of(results.merge([long, short]))
+    table = score_table(evidence)
+    assert cell(table, "walker2d-medium-sb3", "ours: PBRL") == "91.0 ± 1.4 (after 10,000)", "not bold, though the best"
+    assert cell(table, "walker2d-medium-sb3", "ours: BC") == "**42.0 ± 2.0**"
+    assert "PBRL" not in {row[0] for row in aggregate_tables(evidence)["sb3"].rows}
+    assert dict(row[:2] for row in runtime_table(evidence).rows)["PBRL"] == "2.0"
+    assert (
+        evidence_of(results.merge([long, short]), n_updates=50_000).last_of_other_length(
+            TABLE.variant("PBRL"), "walker2d-medium-sb3"
+        )
+        is None
+    ), "a length that was asked for is the only one"
 
 
 def test_totals_have_the_papers_sum_of_deviations_beside_the_honest_one() -> None:

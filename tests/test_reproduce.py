@@ -94,6 +94,19 @@ def test_parts_of_a_grid_are_chosen_by_agent_and_seed(tmp_path: Path) -> None:
     assert {(r.spec.n_updates, r.spec.eval_freq) for r in planned} == {(4, 2)}
 
 
+def test_precision_of_a_call_is_that_of_its_runs(tmp_path: Path) -> None:
+    request = Request(("table1",), "smoke", tmp_path, agents=("DCE", "CQL"), seeds=1, precision="bf16-matmul")
+    experiment = load_experiment("table1")
+    planned = plan_runs(experiment, scale_of(experiment, request), request)
+    assert [r.spec.overrides["precision"] for r in planned] == ["bf16-matmul"] * 2
+    plain = plan_runs(experiment, scale_of(experiment, request), replace(request, precision="float32"))
+    assert [r.key for r in planned] == [r.key for r in plain] and [r.spec.folder for r in planned] == [
+        r.spec.folder for r in plain
+    ]
+    with pytest.raises(ConfigError, match="must be one of 'float32', 'bf16-matmul', 'tf32'"):
+        reproduce(replace(request, precision="bf16"), Console(quiet=True))
+
+
 @pytest.mark.parametrize(("device", "message"), [("gpu", "must be one of 'auto', 'cpu', 'cuda'"), ("cuda", "no CUDA device")])
 def test_device_that_is_not_there_is_said(device: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(th.cuda, "is_available", lambda: False)

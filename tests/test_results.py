@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 from result_rows import run_rows
 
 from sb3_dce.data.catalog import normalized_score
@@ -60,6 +61,19 @@ def test_imported_folder_is_the_run_that_a_grid_asks_for(finished: Path) -> None
     (key,) = results.done_keys(rows)
     assert key[:2] == (TINY, "dce") and key[3:] == (12, 3)
     assert results.merge([rows, rows]).equals(rows) and results.without(rows, rows).empty
+
+
+def test_precision_makes_no_other_run_and_stands_beside_the_device(finished: Path, tmp_path: Path) -> None:
+    shutil.copytree(finished, tmp_path / "run")
+    config = yaml.safe_load((finished / "config.yml").read_text())
+    for part in (config["run"]["overrides"], config["hyperparameters"]):
+        part["precision"] = "bf16-matmul"
+    (tmp_path / "run" / "config.yml").write_text(yaml.safe_dump(config))
+    plain, rounded = results.rows_of_run(finished, "table1"), results.rows_of_run(tmp_path / "run", "table1")
+    assert plain is not None and rounded is not None
+    assert set(plain["device"]) == {"cpu"} and set(rounded["device"]) == {"cpu bf16-matmul"}
+    assert results.done_keys(plain) == results.done_keys(rounded)
+    assert set(rounded["hyperparameters"]) == set(plain["hyperparameters"])
 
 
 def test_run_that_is_not_complete_has_no_rows(finished: Path, tmp_path: Path) -> None:

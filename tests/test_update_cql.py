@@ -248,6 +248,17 @@ def test_cloning_at_the_start_compiles_twice_and_not_per_step(transitions: Trans
     assert len(compiled._engine._compiled) == 2
 
 
+@pytest.mark.slow
+@needs_compiler
+def test_update_with_rounded_products_is_compiled(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_dce.precision._missing", lambda precision, device: None)
+    monkeypatch.setattr("sb3_dce.precision._rounds_itself", lambda: False)
+    settings = {"n_actions": 2, "policy_kwargs": {"net_arch": [32]}, "precision": "bf16-matmul", "execution": "compile"}
+    model = make_model(transitions, **settings)
+    model.train(2, BATCH)
+    assert model._engine.execution == "compile", "not fallen back to eager"
+
+
 @pytest.mark.parametrize("clone", [False, True])
 def test_three_models_at_once_equal_three_single_runs(
     clone: bool, transitions: Transitions, monkeypatch: pytest.MonkeyPatch
