@@ -36,6 +36,10 @@ UPDATES_WORTH_COMPILING = 10_000
 UPDATES_WORTH_A_COMPILED_CALLER = 100_000
 
 
+# Compiled updates of different agents or settings in one process; more run eager.
+MAX_COMPILED_UPDATES = 200
+
+
 def choose_execution(execution: str, planned_updates: int, device: th.device) -> str:
     """
     :param execution: "auto", "eager", "compile" or "cudagraph"
@@ -64,6 +68,11 @@ def choose_execution(execution: str, planned_updates: int, device: th.device) ->
 
 def _has_compiler() -> bool:
     return any(shutil.which(name) for name in ("g++", "clang++", "c++", "cl"))
+
+
+def _room_for_compiled_updates() -> contextlib.AbstractContextManager[None]:
+    """To PyTorch the updates of all engines of a process are forms of one function, of which it takes 8 by default."""
+    return th._dynamo.config.patch(recompile_limit=MAX_COMPILED_UPDATES)
 
 
 class State(Protocol):
@@ -170,7 +179,8 @@ class Engine(Generic[S]):
             with th.compiler.set_stance(skip_guard_eval_unsafe=True):
                 yield
         else:
-            yield
+            with _room_for_compiled_updates():
+                yield
             self._guarded_for.add((key, sizes))
 
     def _compiled_step(self, key: Variant) -> Step:
@@ -184,7 +194,8 @@ class Engine(Generic[S]):
 
         def first_call(*arguments: Any) -> dict[str, th.Tensor]:
             try:
-                metrics = compiled(*arguments)
+                with _room_for_compiled_updates():
+                    metrics = compiled(*arguments)
                 self._compiled[key] = compiled
             except Exception as error:
                 warnings.warn(f"compiling the update failed, running eager: {str(error).splitlines()[0]}", SB3DCEWarning)

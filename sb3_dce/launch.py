@@ -157,7 +157,7 @@ def train_one(spec: RunSpec, report: runs.Report) -> dict[str, Any]:
     :raises SB3DCEError: for other errors; the report of an unexpected one is in ``error.txt`` of the folder
     """
     if "torch._dynamo" in sys.modules:
-        # The update of each run counts against the compiler's limit of one function's forms, past which it gives up.
+        # What was compiled for an earlier run would stay in memory, and be asked at each call whether it fits.
         th.compiler.reset()
     try:
         return runs.run(spec, report)

@@ -12,7 +12,7 @@ import torch as th
 from torch.nn import functional as F
 from update_tools import all_tensors, largest_difference, needs_compiler, record_steps, to_float64
 
-from sb3_dce import OfflineDCE, Transitions
+from sb3_dce import OfflineBC, OfflineDCE, Transitions
 from sb3_dce.capture import CapturedStep, CaptureError, StaticInputs
 from sb3_dce.errors import ConfigError, SB3DCEWarning
 from sb3_dce.execution import UPDATES_WORTH_A_COMPILED_CALLER, choose_execution
@@ -263,6 +263,19 @@ def test_a_compiled_update_follows_the_batch_size(transitions: Transitions) -> N
             model.train(2, batch_size)
         models.append(all_tensors(model))
     assert largest_difference(*models) < 1e-10
+
+
+@needs_compiler
+def test_many_models_of_one_process_are_all_compiled(transitions: Transitions) -> None:
+    kwargs = {"dataset": transitions, "execution": "compile", "seed": 0, "device": "cpu"}
+    th.compiler.reset()  # what earlier tests have compiled
+    with th._dynamo.config.patch(recompile_limit=1):
+        for width in (8, 9):
+            model = OfflineBC("MlpPolicy", policy_kwargs={"net_arch": [width]}, **kwargs)
+            model.train(1, 8)
+            assert model._engine.execution == "compile"
+        model.train(1, 12)  # another number of rows is another form
+    assert model._engine.execution == "compile"
 
 
 @needs_compiler
