@@ -161,23 +161,27 @@ def summarize(
     :return: one row per agent that has a complete run
     """
     dataset_id = None if spec is None else spec.id
-    results = {algo: [r for r in map(read_result, sorted((folder / algo).glob("seed_*"))) if r] for algo in algos}
-    results = {algo: found for algo, found in results.items() if found}
-    if not results:
+    runs = {algo: {run: r for run in sorted((folder / algo).glob("seed_*")) if (r := read_result(run))} for algo in algos}
+    runs = {algo: found for algo, found in runs.items() if found}
+    if not runs:
         raise ConfigError("no complete run", where=str(folder), hint="Run the comparison first; it goes on where it stopped.")
+    results = {algo: list(found.values()) for algo, found in runs.items()}
     _write_csv(folder / "comparison.csv", results)
-    rows = [_row(algo, found, dataset_id is not None) for algo, found in results.items()]
+    scored = dataset_id is not None
+    rows = [_row(algo, found, scored) for algo, found in results.items()]
     level = data_return
     if level is not None and dataset_id is not None:
         level = float(normalized_score(dataset_id, level))
-    _show(rows, level, dataset_id is not None, console)
-    curves = {algo: [read_evaluations(run, dataset_id) for run in sorted((folder / algo).glob("seed_*"))] for algo in results}
-    # a run that has not been evaluated yet has no part in the mean, which goes as far as the shortest
+    table = _cells(rows, level, scored)
+    _show(table, console)
+    curves = {algo: [read_evaluations(run, dataset_id) for run in found] for algo, found in runs.items()}
+    # a run without evaluations has no part in the mean, which goes as far as the shortest
     curves = {algo: evaluated for algo, seeds in curves.items() if (evaluated := [seed for seed in seeds if seed])}
     levels = {} if level is None else {"mean of the data": level}
     title = folder.name.removeprefix("compare-") if dataset_id is None else dataset_id
     picture = plot_learning_curves(curves, folder / "comparison.png", title, levels, confidence=True)
-    console.print(f"saved  {folder}/comparison.csv" + (f", {picture.name}" if picture else ""), markup=False)
+    _write_markdown(folder / "comparison.md", title, table, picture)
+    console.print(f"saved  {folder}/comparison.md, comparison.csv" + (f", {picture.name}" if picture else ""), markup=False)
     return rows
 
 
@@ -190,19 +194,39 @@ def _row(algo: str, results: list[dict[str, Any]], scored: bool) -> Row:
     return Row(algo, len(results), results[0]["n_updates"], float(known.mean()), std, seconds, overrides)
 
 
-def _show(rows: list[Row], data_level: float | None, scored: bool, console: Console) -> None:
-    table = Table(box=None, header_style="bold")
-    table.add_column("agent")
-    for title in ("normalised score" if scored else "return", "± over seeds", "seeds", "updates", "s per 1000 updates"):
-        table.add_column(title, justify="right")
+def _cells(rows: list[Row], data_level: float | None, scored: bool) -> list[list[str]]:
+    """Heading and lines of the table, the best first."""
+    heading = ["agent", "set", "normalised score" if scored else "return"]
+    lines = [[*heading, "± over seeds", "seeds", "updates", "s per 1000 updates"]]
     for row in sorted(rows, key=lambda row: -row.mean):
+        changed = ", ".join(f"{name}={value}" for name, value in row.overrides.items())
         spread = "-" if np.isnan(row.std) else f"{row.std:.1f}"
-        cells = (f"{row.mean:.1f}", spread, str(row.n_seeds), f"{row.n_updates:,}", f"{row.seconds_per_1000:.1f}")
-        changed = "".join(f"  {name}={value}" for name, value in row.overrides.items())
-        table.add_row(f"{row.agent}[dim]{escape(changed)}[/dim]", *cells)
+        numbers = [f"{row.mean:.1f}", spread, str(row.n_seeds), f"{row.n_updates:,}", f"{row.seconds_per_1000:.1f}"]
+        lines.append([row.agent, changed, *numbers])
     if data_level is not None:
-        table.add_row("mean of the data", f"{data_level:.1f}", "", "", "", "")
+        lines.append(["mean of the data", "", f"{data_level:.1f}", "", "", "", ""])
+    if not any(line[1] for line in lines[1:]):
+        lines = [[line[0], *line[2:]] for line in lines]
+    return lines
+
+
+def _show(lines: list[list[str]], console: Console) -> None:
+    table = Table(box=None, header_style="bold")
+    for title in lines[0]:
+        table.add_column(title, justify="left" if title in ("agent", "set") else "right")
+    for line in lines[1:]:
+        table.add_row(*map(escape, line))
     console.print(table)
+
+
+def _write_markdown(path: Path, title: str, lines: list[list[str]], picture: Path | None) -> None:
+    rule = ["---"] * len(lines[0])
+    text = [f"# Agents on {title}", "", *(f"| {' | '.join(line)} |" for line in (lines[0], rule, *lines[1:])), ""]
+    text += ["Last evaluation of each run; the seconds are wall time, evaluations included.", ""]
+    if picture is not None:
+        text += [f"![Learning curves]({picture.name})", ""]
+    with write_atomically(path) as stream:
+        stream.write("\n".join(text).encode())
 
 
 def _write_csv(path: Path, results: dict[str, list[dict[str, Any]]]) -> None:

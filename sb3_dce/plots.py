@@ -11,6 +11,9 @@ from sb3_dce.evaluation import Evaluation
 # 97.5 % quantiles of Student's t by degrees of freedom.
 STUDENT_T = {1: 12.706, 2: 4.303, 3: 3.182, 4: 2.776, 5: 2.571, 6: 2.447, 7: 2.365, 8: 2.306, 9: 2.262, 10: 2.228}
 
+# Names of more lines than this stand beside the picture.
+MOST_INSIDE = 5
+
 
 def plot_learning_curves(
     curves: dict[str, list[list[Evaluation]]],
@@ -35,7 +38,8 @@ def plot_learning_curves(
         from matplotlib.figure import Figure
     except ImportError:
         return None
-    figure = Figure(figsize=(7.0, 4.2), layout="constrained")  # no pyplot: no window system is touched
+    wide = len(curves) + len(levels or {}) > MOST_INSIDE
+    figure = Figure(figsize=(9.0 if wide else 7.0, 4.2), layout="constrained")  # no pyplot: no window system is touched
     axes = figure.add_subplot()
     scored = all(e.score is not None for seeds in curves.values() for seed in seeds for e in seed)
     for number, (name, seeds) in enumerate(curves.items()):
@@ -55,7 +59,10 @@ def plot_learning_curves(
     axes.set_ylabel("normalised score" if scored else "return")
     axes.set_title(title)
     axes.grid(alpha=0.3)
-    axes.legend(loc="best", fontsize=8)
+    if wide:
+        figure.legend(loc="outside right upper", fontsize=8)
+    else:
+        axes.legend(loc="best", fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)
     return path

@@ -28,6 +28,7 @@ def test_comparison_trains_writes_and_goes_on(tmp_path: Path) -> None:
     rows = compare(*arguments, quiet)
     assert [row.agent for row in rows] == ["offline_bc", "sac_v"] and all(row.n_updates == 4 for row in rows)
     assert (tmp_path / "comparison.png").stat().st_size > 10_000
+    assert f"| offline_bc | {rows[0].mean:.1f} | - | 1 | 4 |" in (tmp_path / "comparison.md").read_text()
     with (tmp_path / "comparison.csv").open() as text:
         written = list(csv.DictReader(text))
     result = json.loads((tmp_path / "offline_bc" / "seed_0" / "result.json").read_text())
@@ -76,6 +77,7 @@ def test_table_is_made_from_the_complete_runs(tmp_path: Path, capsys: pytest.Cap
             result = {"config": {"seed": seed}, "n_updates": 2000, "seconds": 10.0, "mean_return": 1.0}
             (folder / "result.json").write_text(json.dumps({**result, "normalized_score": score}))
     (tmp_path / "dce" / "seed_3").mkdir()  # begun, not complete
+    write_evaluations(tmp_path / "dce" / "seed_3", [Evaluation(10, (1.0, 2.0), (5, 5), None)])
     rows = summarize(tmp_path, ["offline_bc", "dce", "offline_iql"], resolve(TINY), 4651.0, Console(width=120))
     assert [(row.agent, row.n_seeds, row.mean) for row in rows] == [("offline_bc", 1, 40.0), ("dce", 3, 45.0)]
     assert rows[1].std == pytest.approx(np.std(scores["dce"], ddof=1)) and np.isnan(rows[0].std)
