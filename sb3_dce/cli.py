@@ -66,7 +66,7 @@ def train(
     train_seeds(
         algo=algo,
         dataset=dataset,
-        n_updates=int(updates) or None,
+        n_updates=_steps(updates) or None,
         seeds=range(first_seed, first_seed + seeds),
         eval_freq=eval_freq,
         n_eval_episodes=eval_episodes,
@@ -110,7 +110,7 @@ def compare(
     names = list(_names(algos))
     n_workers = workers or os.cpu_count() or 1
     run_comparison(
-        *(dataset, names, int(updates), range(seeds), eval_freq, eval_episodes, n_workers, out, console),
+        *(dataset, names, _steps(updates), range(seeds), eval_freq, eval_episodes, n_workers, out, console),
         overrides=_parse_overrides(set_ or []),
         updates_of=_parse_lengths(updates_of or []),
     )
@@ -173,7 +173,7 @@ def reproduce(
         agents=_names(agents),
         seeds=seeds or None,
         first_seed=first_seed,
-        updates=int(updates) or None,
+        updates=_steps(updates) or None,
         eval_freq=eval_freq or None,
         workers=workers or os.cpu_count() or 1,
         device=device,
@@ -228,6 +228,13 @@ def _parse_overrides(pairs: list[str]) -> dict[str, Any]:
     return overrides
 
 
+def _steps(updates: float) -> int:
+    """Gradient steps are written as 1e6, too, and so arrive as a float."""
+    if not updates.is_integer():  # nor are infinity and NaN
+        raise ConfigError(f"--updates must be a whole number, got {updates:g}", key="--updates", hint="For example 1e5.")
+    return int(updates)
+
+
 def _parse_lengths(pairs: list[str]) -> dict[str, int]:
     lengths = {}
     for pair in pairs:
@@ -249,6 +256,11 @@ def main() -> None:
         app()
     except SB3DCEError as error:
         Console(stderr=True, highlight=False, soft_wrap=True).print(f"Error: {error}", markup=False)
+        sys.exit(2)
+    except OSError as error:
+        # A folder that cannot be written, a full disk: the system's own words and the path are all there is to say.
+        named = f" ({error.filename})" if error.filename else ""
+        Console(stderr=True, highlight=False, soft_wrap=True).print(f"Error: {error.strerror or error}{named}", markup=False)
         sys.exit(2)
     except KeyboardInterrupt:
         Console(stderr=True).print("\nInterrupted. The same command goes on from the last checkpoint.")

@@ -19,13 +19,13 @@ from sb3_dce.agents import agent_class
 from sb3_dce.data import find_file, load_transitions
 from sb3_dce.data.catalog import DatasetSpec, normalized_score
 from sb3_dce.data.locate import short_name
-from sb3_dce.errors import ConfigError
+from sb3_dce.errors import ConfigError, DivergenceError
 from sb3_dce.evaluation import read_evaluations
 from sb3_dce.files import write_atomically
 from sb3_dce.hyperparams import check_keys, full_name
-from sb3_dce.launch import launch
+from sb3_dce.launch import launch_all
 from sb3_dce.plots import plot_learning_curves
-from sb3_dce.runs import RunSpec, read_result
+from sb3_dce.runs import RunSpec, read_divergence, read_result
 
 COLUMNS = ("agent", "seed", "n_updates", "mean_return", "normalized_score", "seconds", "seconds_per_1000", "overrides")
 
@@ -81,8 +81,8 @@ def compare(
         ``{"dce.beta": 2.0}`` for one
     :param updates_of: gradient steps of single agents, instead of ``n_updates``
     :return: the table
-    :raises ConfigError: for an unknown agent, or a setting that none of them has
-    :raises SB3DCEError: the first error of a run; what the others have done is kept and resumed by the same call
+    :raises ConfigError: for an unknown agent, a setting that none of them has, or a length without an evaluation at its end
+    :raises SB3DCEError: the first error of a run, after all others; the same call goes on. A run that diverges is no error
     """
     algos = [full_name(algo) for algo in algos]
     if len(set(algos)) != len(algos) or not algos:
@@ -90,7 +90,7 @@ def compare(
             f"name each agent once, got {', '.join(algos)}", key="--algos", hint="For example --algos dce,offline_bc."
         )
     settings = settings_of(algos, overrides or {})
-    lengths = _lengths(algos, n_updates, updates_of or {})
+    lengths = _lengths(algos, n_updates, updates_of or {}, eval_freq)
     path, spec = find_file(dataset)
     name = short_name(dataset)
     folder = out or Path("runs") / f"compare-{name}"
@@ -105,10 +105,17 @@ def compare(
         for seed in seeds  # all agents of a seed before the next seed: an interrupted comparison is a smaller one
         for algo in algos
     ]
-    launch(specs, workers, console)
+    # What diverges is a result, and would do the same again.
+    outcomes = launch_all([spec for spec in specs if read_divergence(Path(spec.folder)) is None], workers, console)
+    errors = [outcome for outcome in outcomes if isinstance(outcome, BaseException)]
+    if other := [error for error in errors if not isinstance(error, DivergenceError)]:
+        raise other[0]
+    for run in specs:
+        if (divergence := read_divergence(Path(run.folder))) is not None:
+            console.print(f"diverged: {run.name}, {divergence['reason']}", markup=False)
     info = load_transitions(dataset).info
     level = float(info.episode_returns.mean()) if len(info.episode_returns) else None
-    return summarize(folder, algos, spec, level, console)
+    return summarize(folder, algos, spec, level, console, lengths)
 
 
 def settings_of(algos: Sequence[str], overrides: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -124,20 +131,28 @@ def settings_of(algos: Sequence[str], overrides: Mapping[str, Any]) -> dict[str,
         prefix, _, key = name.rpartition(".")
         if prefix:
             algo = _one_of(algos, prefix, "--set")
-            check_keys(classes[algo], {key: value}, where="--set")
+            check_keys(classes[algo], [key], where="--set", zoo_keys=False)
             settings[algo][key] = value
             continue
         having = [algo for algo, cls in classes.items() if key in inspect.signature(cls).parameters]
         if not having:
-            check_keys(classes[algos[0]], {key: value}, where="--set")
+            check_keys(classes[algos[0]], [key], where="--set", zoo_keys=False)
         for algo in having:
             settings[algo].setdefault(key, value)  # what is set for one agent alone counts more
     return settings
 
 
-def _lengths(algos: Sequence[str], n_updates: int, updates_of: Mapping[str, int]) -> dict[str, int]:
+def _lengths(algos: Sequence[str], n_updates: int, updates_of: Mapping[str, int], eval_freq: int) -> dict[str, int]:
     named = {_one_of(algos, name, "--updates-of"): length for name, length in updates_of.items()}
-    return {algo: named.get(algo, n_updates) for algo in algos}
+    lengths = {algo: named.get(algo, n_updates) for algo in algos}
+    for algo, length in lengths.items():
+        if length % eval_freq:
+            raise ConfigError(
+                f"{length} gradient steps of {algo} do not end with an evaluation, which there is every {eval_freq}",
+                key="--updates",
+                hint=f"Take a multiple of {eval_freq}, or another --eval-freq.",
+            )
+    return lengths
 
 
 def _one_of(algos: Sequence[str], name: str, key: str) -> str:
@@ -148,7 +163,12 @@ def _one_of(algos: Sequence[str], name: str, key: str) -> str:
 
 
 def summarize(
-    folder: Path, algos: Sequence[str], spec: DatasetSpec | None, data_return: float | None, console: Console
+    folder: Path,
+    algos: Sequence[str],
+    spec: DatasetSpec | None,
+    data_return: float | None,
+    console: Console,
+    lengths: Mapping[str, int] | None = None,
 ) -> list[Row]:
     """
     Make table and picture from the result files of a comparison, complete or not.
@@ -158,10 +178,13 @@ def summarize(
     :param spec: catalogue entry of the dataset, if there is one
     :param data_return: mean return of the data's episodes, if there are any
     :param console: where to print
+    :param lengths: only runs of so many gradient steps, by agent; ``None`` for all
     :return: one row per agent that has a complete run
     """
     dataset_id = None if spec is None else spec.id
     runs = {algo: {run: r for run in sorted((folder / algo).glob("seed_*")) if (r := read_result(run))} for algo in algos}
+    if lengths is not None:
+        runs = {algo: {f: r for f, r in found.items() if r["n_updates"] == lengths[algo]} for algo, found in runs.items()}
     runs = {algo: found for algo, found in runs.items() if found}
     if not runs:
         raise ConfigError("no complete run", where=str(folder), hint="Run the comparison first; it goes on where it stopped.")

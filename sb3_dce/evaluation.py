@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
+import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +19,7 @@ from sb3_dce.checks import check_number
 from sb3_dce.data.catalog import normalized_score, resolve
 from sb3_dce.data.minari import is_minari_name
 from sb3_dce.envs import make_env_if_possible, make_minari_env, missing_simulator
-from sb3_dce.errors import DatasetError
+from sb3_dce.errors import CheckpointError, DatasetError
 from sb3_dce.evaluation_pool import EvaluationPool
 from sb3_dce.files import write_atomically
 from sb3_dce.rollouts import Rollouts, deterministic_act
@@ -235,10 +237,15 @@ def read_evaluations(folder: Path, dataset_id: str | None) -> list[Evaluation]:
     :param folder: folder of a run
     :param dataset_id: defines the score
     :return: its evaluations so far
+    :raises CheckpointError: if the file is damaged
     """
     path = folder / "evaluations.npz"
     if not path.is_file():
         return []
-    with np.load(path, allow_pickle=False) as data:
-        rows = zip(data["timesteps"], data["results"], data["ep_lengths"], strict=True)
-        return [Evaluation(int(n), tuple(map(float, r)), tuple(map(int, e)), dataset_id) for n, r, e in rows]
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            rows = list(zip(data["timesteps"], data["results"], data["ep_lengths"], strict=True))
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        hint = "Delete the folder; the same command trains the run again."
+        raise CheckpointError("the file is damaged", where=str(path), path=path, hint=hint) from error
+    return [Evaluation(int(n), tuple(map(float, r)), tuple(map(int, e)), dataset_id) for n, r, e in rows]

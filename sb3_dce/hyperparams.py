@@ -135,17 +135,18 @@ def split_row(row: dict[str, Any]) -> SplitRow:
     return SplitRow(kwargs, int(row["n_timesteps"]), zoo)
 
 
-def check_keys(cls: type, keys: Iterable[str], where: str = "hyperparameters") -> None:
+def check_keys(cls: type, keys: Iterable[str], where: str = "hyperparameters", zoo_keys: bool = True) -> None:
     """
     Refuse a key that neither the constructor nor the zoo knows; otherwise it surfaces as a ``TypeError`` much later.
 
     :param cls: class the row is for
     :param keys: the row, or its keys
     :param where: file or argument the keys come from, for the message
+    :param zoo_keys: whether keys that only the zoo's launcher reads are allowed
     :raises ConfigError: naming the key, the closest parameter and the file
     """
     parameters = [name for name in inspect.signature(cls).parameters if not name.startswith("_")]
-    allowed = {*parameters, *ZOO_KEYS}
+    allowed = {*parameters, *(ZOO_KEYS if zoo_keys else ())}
     for key in keys:
         if key not in allowed:
             raise ConfigError(

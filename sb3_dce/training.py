@@ -54,7 +54,7 @@ def train_seeds(
     """
     algo = hyperparams.full_name(algo)
     agent = agent_class(algo)
-    hyperparams.check_keys(agent, overrides, where="--set")
+    hyperparams.check_keys(agent, overrides, where="--set", zoo_keys=False)
     path, spec = find_file(dataset)
     row = hyperparams.load_row(algo, None if spec is None else spec.id)
     total = n_updates or hyperparams.split_row(row).n_timesteps

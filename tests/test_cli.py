@@ -165,7 +165,13 @@ def test_an_interrupted_run_goes_on_and_ends_like_an_uninterrupted_one(tmp_path:
         (("train", TINY, "--set", "betta=2"), ("'betta'", "Did you mean 'beta'")),
         (("train", TINY, "--set", "beta"), ("KEY=VALUE",)),
         (("train", TINY, "--set", "expectile=1.7"), ("expectile must be", "1.7", "0.7")),
+        (("train", TINY, "--set", "n_timesteps=5"), ("no parameter 'n_timesteps'",)),
+        (("train", TINY, "--updates", "inf"), ("whole number", "inf")),
+        (("train", TINY, "--updates", "0.5"), ("whole number", "0.5")),
         (("train", TINY, "--algo", "dse"), ("unknown algorithm 'dse'", "dce")),
+        (("compare", "--dataset", TINY, "--updates", "inf"), ("whole number", "inf")),
+        (("compare", "--dataset", TINY, "--updates-of", "pbrl"), ("AGENT=UPDATES", "pbrl=1e4")),
+        (("reproduce", ","), ("no experiment is named", "--list")),
         (("evaluate", "missing.zip"), ("no such file",)),
         (("datasets", "info", "nonsense"), ("nonsense",)),
     ],
@@ -178,6 +184,13 @@ def test_user_errors_are_one_clear_message(
     assert list(tmp_path.iterdir()) == []
     for word in words:
         assert word in message
+
+
+@pytest.mark.parametrize("command", [("reproduce", "config-tables"), ("compare", "--dataset", TINY, "--updates", "4")])
+def test_folder_that_is_a_file_is_one_clear_message(command: tuple[str, ...], tmp_path: Path) -> None:
+    (tmp_path / "taken").write_text("")
+    arguments = (*command, "--eval-freq", "2", "--out", str(tmp_path / "taken"))
+    assert str(tmp_path / "taken") in refused(sb3_dce(*arguments))
 
 
 def test_bad_files_are_one_clear_message(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

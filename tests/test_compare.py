@@ -52,6 +52,23 @@ def test_single_agents_have_their_own_settings_and_length(tmp_path: Path, capsys
         assert json.loads(list(csv.DictReader(text))[1]["overrides"]) == rows[1].overrides
 
 
+def test_agent_that_diverges_does_not_end_the_comparison(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = (TINY, ["bc", "sac_v"], 4, range(1), 2, 1, 2, tmp_path)
+    settings = {"sac_v.learning_rate": 1e30, "sac_v.max_grad_norm": None}
+    for _ in range(2):  # the second call does not try again
+        rows = compare(*arguments, Console(width=140), overrides=settings)
+        assert [row.agent for row in rows] == ["offline_bc"]
+        assert "diverged: sac_v seed 0, training diverged" in capsys.readouterr().out
+    assert (tmp_path / "comparison.md").is_file()
+
+
+def test_runs_of_another_length_are_not_in_the_table(tmp_path: Path) -> None:
+    quiet = Console(quiet=True)
+    compare(TINY, ["bc"], 2, range(2), 2, 1, 2, tmp_path, quiet)
+    (row,) = compare(TINY, ["bc"], 4, range(1), 2, 1, 2, tmp_path, quiet)  # one of the two is made longer
+    assert (row.n_seeds, row.n_updates) == (1, 4)
+
+
 def test_settings_and_lengths_of_nobody_are_refused(tmp_path: Path) -> None:
     assert settings_of(["offline_bc", "offline_iql"], {"expectile": 0.8}) == {
         "offline_bc": {},
@@ -64,6 +81,10 @@ def test_settings_and_lengths_of_nobody_are_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(ConfigError, match=message):
             settings_of(["offline_bc", "offline_iql"], overrides)
+    with pytest.raises(ConfigError, match="no parameter 'n_timesteps'"):  # only the zoo's launcher knows it
+        settings_of(["offline_bc"], {"n_timesteps": 5})
+    with pytest.raises(ConfigError, match="3 gradient steps of offline_bc do not end with an evaluation"):
+        compare(TINY, ["bc"], 3, range(1), 2, 1, 1, tmp_path, Console(quiet=True))
     with pytest.raises(ConfigError, match="'cql' is not compared here"):
         compare(TINY, ["bc"], 4, range(1), 2, 1, 1, tmp_path, Console(quiet=True), updates_of={"cql": 2})
 

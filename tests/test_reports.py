@@ -17,7 +17,7 @@ from sb3_dce.experiments.figures import panel_curves
 from sb3_dce.experiments.grid import experiment_ids, load_experiment, variant_hash
 from sb3_dce.experiments.reports import config_table, make_report, toy_table
 from sb3_dce.experiments.tables import TextTable, aggregate_tables, runtime_table, score_table
-from sb3_dce.experiments.verdicts import HELD, NOT_HELD, UNTESTED, verdicts
+from sb3_dce.experiments.verdicts import HELD, NOT_HELD, UNTESTED, Verdict, verdicts
 from sb3_dce.theory import shift_factor
 
 TABLE, BETA = load_experiment("table1"), load_experiment("fig-beta")
@@ -182,15 +182,70 @@ def test_claims_on_beta_fail_on_rows_that_break_them(change: dict[str, object], 
     assert verdict.outcome == NOT_HELD
 
 
+HALFCHEETAHS = [f"halfcheetah-{kind}-sb3" for kind in ("random", "medium", "medium-replay", "medium-expert")]
+
+
+def claim_of(rows: pd.DataFrame, label: str, name: str = "table1") -> Verdict:
+    (verdict,) = [v for v in verdicts(evidence_of(rows, name)) if v.claim.startswith(label)]
+    return verdict
+
+
 def test_claims_on_places_are_not_tested_on_d4rl_and_own_data_together() -> None:
-    own = [f"halfcheetah-{kind}-sb3" for kind in ("random", "medium", "medium-replay", "medium-expert")]
-    both = ["halfcheetah-random-v2", "halfcheetah-medium-v2", *own[:2]]
+    both = ["halfcheetah-random-v2", "halfcheetah-medium-v2", *HALFCHEETAHS[:2]]
     outcomes = []
-    for names in (both, own):
+    for names in (both, HALFCHEETAHS):
         rows = table_rows(TABLE, {name: scores(DCE=[90.0]) for name in names})
-        (verdict,) = [v for v in verdicts(evidence_of(rows)) if v.claim.startswith("C4")]
-        outcomes.append(verdict.outcome)
+        outcomes.append(claim_of(rows, "C4").outcome)
     assert outcomes == [UNTESTED, HELD]
+
+
+def test_claims_on_places_need_all_the_papers_agents_at_one_length() -> None:
+    without = {name: values for name, values in scores(DCE=[90.0]).items() if name != "PBRL"}
+    verdict = claim_of(table_rows(TABLE, {name: without for name in HALFCHEETAHS}), "C4")
+    assert verdict.outcome == UNTESTED and "without PBRL" in verdict.numbers
+    parts = [table_rows(TABLE, {n: scores(DCE=[90.0])}, n_updates=1000 * (i + 1)) for i, n in enumerate(HALFCHEETAHS)]
+    assert claim_of(results.merge(parts), "C4").outcome == UNTESTED
+
+
+def test_an_advantage_within_chance_is_none() -> None:
+    experts = [f"{task}-medium-expert-sb3" for task in ("halfcheetah", "hopper", "walker2d")]
+    for dce, outcome in (([40.0, 43.0, 46.0], HELD), ([80.0, 83.0, 86.0], NOT_HELD), ([80.0], UNTESTED)):
+        rows = table_rows(TABLE, {name: scores(DCE=dce) for name in experts})
+        assert claim_of(rows, "C6").outcome == outcome
+
+
+def test_order_of_run_times_holds_with_hastened_slow_agents_but_does_not_fail_with_them() -> None:
+    def judged(cql_seconds: float) -> Verdict:
+        seconds = {"BC": 2.0, "IQL": 8.0, "DCE": 12.0, "CQL": cql_seconds, "UWAC": 400.0}
+        parts = [run_rows(TABLE, name, CHEETAH, 0, 40.0, seconds=value) for name, value in seconds.items()]
+        parts[3] = parts[3].assign(device="cpu bf16-matmul")
+        return claim_of(results.merge(parts), "Run times")
+
+    assert judged(90.0).outcome == HELD and "CQL 90.0 s (cpu bf16-matmul)" in judged(90.0).numbers
+    assert judged(9.0).outcome == UNTESTED, "in float32 CQL may well be slower than DCE"
+
+
+def test_claims_on_a_kind_of_data_are_not_tested_on_another() -> None:
+    tau = load_experiment("fig-tau")
+    rows = results.merge(run_rows(tau, v.name, "relocate-expert-sb3", 0, 50.0) for v in tau.variants)
+    (verdict,) = [v for v in verdicts(evidence_of(rows, "fig-tau")) if "relocate" in v.claim]
+    assert verdict.outcome == UNTESTED and verdict.numbers.startswith("expert data, not cloned: expectile 0.5: 50.0")
+
+
+def test_numbers_of_a_verdict_say_on_what_they_rest() -> None:
+    assert all(
+        "halfcheetah-medium-sb3, 100,000 steps, 1 seed" in v.numbers for v in verdicts(evidence_of(beta_rows(), "fig-beta"))
+    )
+
+
+def test_agent_that_diverges_is_one_that_fails() -> None:
+    returns = load_experiment("fig-alpha-return")
+    parts = [run_rows(returns, v.name, CHEETAH, 0, 40.0) for v in returns.variants if v.name != "Eq. 18, alpha 5"]
+    lost = run_rows(returns, "Eq. 18, alpha 5", CHEETAH, 0).iloc[:1].assign(metric="diverged", step=300, value=1.0)
+    verdict = claim_of(results.merge([*parts, lost]), "At alpha 5", "fig-alpha-return")
+    assert verdict.outcome == HELD
+    weak = [run_rows(returns, v.name, CHEETAH, 0, 2.0) for v in returns.variants]
+    assert claim_of(results.merge(weak), "At alpha 5", "fig-alpha-return").outcome == UNTESTED, "half of nothing is nothing"
 
 
 def test_end_of_runs_that_have_diverged_is_not_claimed() -> None:
@@ -215,13 +270,15 @@ def test_gap_to_the_reference_is_zero_on_rows_made_by_the_theory() -> None:
     assert all(np.abs(curve.to_numpy()).max() < 1e-3 for curve, _ in curves.values())
 
 
-def test_reproduction_counts_rows_of_d4rl_only() -> None:
+def test_reproduction_counts_rows_of_d4rl_at_the_papers_length_only() -> None:
     table = {"walker2d-medium-v2": {"DCE": [84.0, 85.0]}, "hopper-medium-v2": {"DCE": [10.0, 11.0]}}
-    rows = table_rows(TABLE, {**table, "walker2d-random-sb3": {"DCE": [0.0, 0.0]}})
-    verdict = make_report(evidence_of(rows)).verdicts[-1]
-    assert verdict.outcome == NOT_HELD and verdict.numbers.startswith(
-        "1 of 2 rows; missed: hopper-medium-v2 (10.5, paper 75.9)"
-    )
+    own = {"walker2d-random-sb3": {"DCE": [0.0, 0.0]}}
+    verdict = make_report(evidence_of(table_rows(TABLE, {**table, **own}, n_updates=1_000_000))).verdicts[-1]
+    missed = "1 of 2 rows, of 12 in the table; missed: hopper-medium-v2 (10.5, paper 75.9)"
+    assert verdict.outcome == NOT_HELD and verdict.numbers.startswith(missed)
+    hit = table_rows(TABLE, {"walker2d-medium-v2": table["walker2d-medium-v2"]}, n_updates=1_000_000)
+    assert make_report(evidence_of(hit)).verdicts[-1].outcome == UNTESTED, "11 rows are not there"
+    assert make_report(evidence_of(table_rows(TABLE, table))).verdicts[-1].outcome == UNTESTED, "too short"
 
 
 def test_cause_of_a_loss_is_the_change_that_closes_the_gap() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from result_rows import run_rows
 from sb3_dce.data.catalog import normalized_score
 from sb3_dce.errors import CheckpointError
 from sb3_dce.experiments import results
-from sb3_dce.experiments.grid import load_experiment
+from sb3_dce.experiments.grid import PlannedRun, load_experiment
 from sb3_dce.experiments.results import ResultsError
 from sb3_dce.runs import RunSpec, run, write_divergence
 
@@ -74,6 +75,16 @@ def test_precision_makes_no_other_run_and_stands_beside_the_device(finished: Pat
     assert set(plain["device"]) == {"cpu"} and set(rounded["device"]) == {"cpu bf16-matmul"}
     assert results.done_keys(plain) == results.done_keys(rounded)
     assert set(rounded["hyperparameters"]) == set(plain["hyperparameters"])
+
+
+def test_rows_count_as_done_on_the_present_file_and_with_enough_episodes(finished: Path) -> None:
+    rows = results.import_runs(finished.parent.parent, "table1")
+    ((dataset, agent, config, n_updates, seed),) = results.done_keys(rows)
+    spec = RunSpec(agent, dataset, seed, n_updates, "folder", 4, 5, QUICK)
+    plan = PlannedRun("table1", "DCE", dataset, spec, config)
+    assert results.done_runs(rows, [plan]) == {plan.key}
+    assert results.done_runs(rows.assign(dataset_sha256="ab" * 32), [plan]) == set(), "the file has changed"
+    assert results.done_runs(rows, [replace(plan, spec=replace(spec, n_eval_episodes=10))]) == set()
 
 
 def test_run_that_is_not_complete_has_no_rows(finished: Path, tmp_path: Path) -> None:
@@ -161,6 +172,14 @@ def test_damaged_file_is_refused_by_name(content: bytes, tmp_path: Path) -> None
     path.write_bytes(content)
     with pytest.raises(ResultsError, match=r"table1\.csv\.gz"):
         results.read_rows(path)
+
+
+def test_damaged_evaluations_are_refused_by_name(finished: Path, tmp_path: Path) -> None:
+    shutil.copytree(finished, tmp_path / "run")
+    path = tmp_path / "run" / "evaluations.npz"
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(CheckpointError, match=r"evaluations\.npz"):
+        results.rows_of_run(tmp_path / "run", "table1")
 
 
 def test_folder_of_something_else_is_refused_by_name(finished: Path, tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ class Evidence:
 
     :param experiment: with its datasets and variants
     :param rows: any rows; those of other experiments count where the run is the same
-    :param scale: "smoke" has configurations of its own, the other scales share theirs
+    :param scale: may change settings of agents, and so decides which configurations are shown
     :param n_updates: only runs of this length; ``None`` takes for each dataset the length most of its variants have
     """
 
@@ -40,6 +40,7 @@ class Evidence:
         self._others: dict[str, pd.DataFrame] = {}
         self._runs: dict[tuple[str, str], pd.DataFrame] = {}
         self.left_out = 0
+        self.of_other_lengths: dict[str, dict[int, int]] = {}
 
     # -- which data ------------------------------------------------------------------------------------------------
 
@@ -82,10 +83,30 @@ class Evidence:
     def id_of(self, paper: str | None) -> str | None:
         """
         :param paper: D4RL id; ``None`` for the grid's first
-        :return: id with results that stands for it, D4RL's own before the twin; ``None`` if there is none
+        :return: id that stands for it, the one with results of more variants, else D4RL's own; ``None`` if there is none
         """
-        dataset = self.experiment.datasets[0] if paper is None else self.experiment.dataset(paper)
-        return next(iter(self.ids(dataset)), None)
+        dataset = self.entry(paper)
+        ids = self.ids(dataset)
+        return max(ids, key=lambda name: sum(bool(len(self.runs(v, name))) for v in self.variants(dataset)), default=None)
+
+    def entry(self, paper: str | None) -> GridDataset:
+        """
+        :param paper: D4RL id; ``None`` for the grid's first
+        :return: its entry in the grid
+        """
+        return self.experiment.datasets[0] if paper is None else self.experiment.dataset(paper)
+
+    def scope(self, dataset_id: str, variants: Iterable[Variant]) -> str:
+        """
+        :param dataset_id: data
+        :param variants: agents
+        :return: data, length and seeds that a statement about them rests on, and which runs are lost
+        """
+        shown = [v for v in variants if len(self.runs(v, dataset_id))]
+        seeds = sorted({self.runs(v, dataset_id)["seed"].nunique() for v in shown}) or [0]
+        lost = [f"{v.name}: {n} diverged" for v in shown if (n := self.n_diverged(v, dataset_id))]
+        word = "seed" if seeds[-1] == 1 else "seeds"
+        return "; ".join([f"{dataset_id}, {self.n_updates(dataset_id) or 0:,} steps, {_listed(seeds)} {word}", *lost])
 
     # -- which runs ------------------------------------------------------------------------------------------------
 
@@ -108,6 +129,8 @@ class Evidence:
             taken = (found["dataset_sha256"] == sha) & (found["n_updates"] == length)
             self.left_out += int((runs["dataset_sha256"] != sha).sum())
             self._others[dataset_id] = found[(found["dataset_sha256"] == sha) & ~taken]
+            other = ours[ours["n_updates"] != length]["n_updates"].value_counts()
+            self.of_other_lengths[dataset_id] = {int(n): int(k) for n, k in other.items()}  # type: ignore[call-overload]
             found = found[taken]
         self._selected[dataset_id] = found
         return found
@@ -156,7 +179,7 @@ class Evidence:
         :param metric: name
         :return: its value at the end of each complete run, in the order of the seeds
         """
-        return _at_end(self.runs(variant, dataset_id), metric)
+        return at_end(self.runs(variant, dataset_id), metric)
 
     def last_of_other_length(self, variant: Variant, dataset_id: str) -> tuple[np.ndarray, int] | None:
         """
@@ -165,7 +188,7 @@ class Evidence:
         :return: scores at the end of the runs of :meth:`of_other_length`, and their gradient steps; ``None`` without any
         """
         rows = self.of_other_length(variant, dataset_id)
-        scores = _at_end(rows, "score")
+        scores = at_end(rows, "score")
         return (scores, int(rows["n_updates"].iloc[0])) if len(scores) else None
 
     def start(self, variant: Variant, dataset_id: str, metric: str) -> float | None:
@@ -195,9 +218,7 @@ class Evidence:
         :param metric: name
         :return: one column per seed, indexed by gradient steps
         """
-        rows = self.runs(variant, dataset_id)
-        rows = rows[(rows["metric"] == metric) & (rows["step"] > 0)]
-        return rows.pivot(index="step", columns="seed", values="value").sort_index()
+        return curve_of(self.runs(variant, dataset_id), metric)
 
     def tail(self, variant: Variant, dataset_id: str, metric: str, share: float = 0.1) -> float | None:
         """
@@ -262,7 +283,7 @@ class Evidence:
         """
         ids = list(dict.fromkeys(dataset_ids))
         shown = list(self.experiment.variants if variants is None else variants)
-        parts = [self.runs(v, name) for name in ids for v in shown]
+        parts = [part for name in ids for v in shown for part in (self.runs(v, name), self.of_other_length(v, name))]
         rows = pd.concat([part for part in parts if len(part)]) if any(len(part) for part in parts) else self._rows.iloc[:0]
         if rows.empty:
             return "No data."
@@ -281,12 +302,37 @@ class Evidence:
         text += f"Data: {'; '.join(data)}. Gradient steps: {_listed(lengths)}; seeds: {_listed(counts)}; last policy"
         text += f", {_listed(episodes)} episodes" if episodes else ""
         text += f". Code {', '.join(sorted(rows['code_version'].unique()))} on {', '.join(sorted(rows['device'].unique()))}."
+        changed = {v.name: known for v in shown if (known := self._scale_settings(v))}
+        if changed and self.scale.source != "embedded":
+            text += " At this scale " + "; ".join(f"{name} has {settings}" for name, settings in changed.items()) + "."
+        hidden = [f"{k} of {n:,} steps on {name}" for name in ids for n, k in self.of_other_lengths.get(name, {}).items()]
+        if hidden:
+            text += f" Further runs, of other lengths: {'; '.join(hidden)}."
         return text
 
+    def _scale_settings(self, variant: Variant) -> str:
+        settings = self.scale.set_for.get(variant.algo, {})
+        return ", ".join(f"{name}={value}" for name, value in settings.items() if name not in variant.set)
 
-def _at_end(rows: pd.DataFrame, metric: str) -> np.ndarray:
+
+def at_end(rows: pd.DataFrame, metric: str) -> np.ndarray:
+    """
+    :param rows: of runs of one agent
+    :param metric: name
+    :return: its value at the end of each run, in the order of the seeds
+    """
     rows = rows[(rows["metric"] == metric) & (rows["step"] == rows["n_updates"])]
     return rows.sort_values("seed")["value"].to_numpy(dtype=float)
+
+
+def curve_of(rows: pd.DataFrame, metric: str) -> pd.DataFrame:
+    """
+    :param rows: of runs of one agent
+    :param metric: name
+    :return: one column per seed, indexed by gradient steps
+    """
+    rows = rows[(rows["metric"] == metric) & (rows["step"] > 0)]
+    return rows.pivot(index="step", columns="seed", values="value").sort_index()
 
 
 def _commonest(values: pd.Series) -> str:

@@ -59,12 +59,14 @@ class GridDataset:
 
     :param paper: D4RL id in the paper's tables
     :param twin: our own data that stand for it; ``None`` where there are none
-    :param note: how these differ in kind
+    :param note: how these differ
+    :param other_kind: whether they are of another kind, so that a claim about the paper's kind cannot be tested on them
     """
 
     paper: str
     twin: str | None = None
     note: str | None = None
+    other_kind: bool = False
 
     @property
     def ids(self) -> tuple[str, ...]:

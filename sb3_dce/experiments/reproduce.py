@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import torch as th
@@ -97,6 +98,8 @@ def parse_ids(text: str) -> tuple[str, ...]:
     :raises ConfigError: for an unknown one
     """
     names = tuple(name.strip() for name in text.split(",") if name.strip())
+    if not names:
+        raise ConfigError("no experiment is named", key="id", hint="See sb3-dce reproduce --list, or take all.")
     return tuple(experiment_ids()) if names == (ALL,) else tuple(load_experiment(name).id for name in names)
 
 
@@ -128,7 +131,7 @@ def reproduce(request: Request, console: Console) -> dict[str, Report]:
             rows = _train(request, experiments, scales, console)
     else:
         rows = results.merge([_known(request), *(results.import_runs(f, request.ids[0]) for f in request.imports)])
-        _keep_rows(rows, request)
+        _keep_rows(rows, request, results.empty())
         # runs of an unfinished call with this folder are shown, and left for it to keep
         rows = results.merge([rows, results.import_runs(request.out / "runs", request.ids[0])])
     evidences, reports = {}, {}
@@ -151,12 +154,14 @@ def _train(request: Request, experiments: list[Experiment], scales: dict[str, Sc
     planned = [run for e in experiments for run in plan_runs(e, scales[e.id], request)]
     imported = results.merge(results.import_runs(folder, request.ids[0]) for folder in request.imports)
     known = results.merge([_known(request), imported])
-    _say_plan(planned, known, scales, console)
-    diverged = execute(planned, results.done_keys(known), request.workers, request.device, request.ray_address, console)
+    done = results.done_runs(known, planned)
+    _say_plan(planned, done, scales, console)
+    diverged = execute(planned, done, request.workers, request.device, request.ray_address, console)
     for text in diverged:
         console.print(f"diverged: {text}", markup=False)
-    rows = results.merge([known, results.planned_rows(planned)])
-    _keep_rows(rows, request)
+    fresh = results.planned_rows(planned)  # first, since a run that is known by fewer episodes has been trained again
+    rows = results.merge([fresh, known])
+    _keep_rows(rows, request, fresh)
     return rows
 
 
@@ -237,9 +242,8 @@ def _with_precision(spec: RunSpec, precision: str) -> RunSpec:
     return replace(spec, overrides={**spec.overrides, "precision": precision})
 
 
-def _say_plan(planned: list[PlannedRun], known: pd.DataFrame, scales: dict[str, Scale], console: Console) -> None:
+def _say_plan(planned: list[PlannedRun], done: set[tuple[Any, ...]], scales: dict[str, Scale], console: Console) -> None:
     runs = {run.spec.folder: run for run in planned}
-    done = results.done_keys(known)
     complete = sum(run.key in done or is_complete(run.spec) for run in runs.values())
     data = ", ".join(dict.fromkeys(run.spec.dataset for run in runs.values()))
     if runs:
@@ -252,16 +256,22 @@ def _say_plan(planned: list[PlannedRun], known: pd.DataFrame, scales: dict[str, 
             "the numbers and verdicts say nothing about the agents",
             markup=False,
         )
+    elif runs:
+        algos = {run.spec.algo for run in runs.values()}
+        changed = {algo: kwargs for scale in scales.values() for algo, kwargs in scale.set_for.items() if algo in algos}
+        for algo, kwargs in changed.items():
+            settings = ", ".join(f"{name}={value}" for name, value in kwargs.items())
+            console.print(f"at this scale {algo} has {settings}", markup=False)
 
 
-def _keep_rows(rows: pd.DataFrame, request: Request) -> None:
-    """One file per experiment; what a reused folder holds is not copied."""
+def _keep_rows(rows: pd.DataFrame, request: Request, fresh: pd.DataFrame) -> None:
+    """One file per experiment; what a reused folder holds is not copied, what has just been trained replaces older rows."""
     folder = request.out / "rows"
-    new = results.without(rows, _known(request))
+    new = results.without(rows, results.without(_known(request), fresh))
     for name in new["experiment"].unique():
         path = folder / f"{name}.csv.gz"
         before = [results.read_rows(path)] if path.is_file() else []
-        results.write_rows(path, results.merge([*before, new[new["experiment"] == name]]))
+        results.write_rows(path, results.merge([new[new["experiment"] == name], *before]))
 
 
 def _report(evidence: Evidence, out: Path, console: Console) -> Report:

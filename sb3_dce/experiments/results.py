@@ -11,6 +11,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import zlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from sb3_dce.data import find_file
 from sb3_dce.data.catalog import resolve
+from sb3_dce.data.hashes import file_sha256
 from sb3_dce.data.locate import short_name
 from sb3_dce.errors import CheckpointError, SB3DCEError
 from sb3_dce.evaluation import catalogue_id, read_evaluations
@@ -140,7 +143,29 @@ def without(rows: pd.DataFrame, others: pd.DataFrame) -> pd.DataFrame:
     :return: the rows of runs that ``others`` does not hold
     """
     known = set(others[RUN_KEY].itertuples(index=False, name=None))
-    return rows[[key not in known for key in rows[RUN_KEY].itertuples(index=False, name=None)]]
+    keys = rows[RUN_KEY].itertuples(index=False, name=None)
+    return rows[np.array([key not in known for key in keys], dtype=bool)]  # a list would choose columns if there are no rows
+
+
+def done_runs(rows: pd.DataFrame, planned: Iterable[PlannedRun]) -> set[tuple[Any, ...]]:
+    """
+    :param rows: rows
+    :param planned: runs of a grid
+    :return: keys of those that the rows hold, on the file that is here now and evaluated over at least as many episodes
+    """
+    lost = set(rows[rows["metric"] == "diverged"][RUN_KEY].itertuples(index=False, name=None))
+    scored = set(rows[rows["metric"].isin(["score", "return"])][RUN_KEY].itertuples(index=False, name=None))
+    counts = rows[rows["metric"] == "n_episodes"]
+    episodes = dict(zip(counts[RUN_KEY].itertuples(index=False, name=None), counts["value"], strict=True))
+    known = set(rows[RUN_KEY].itertuples(index=False, name=None))
+    done = set()
+    for run in planned:
+        dataset, *others = run.key
+        key = (dataset, file_sha256(find_file(dataset)[0]), *others)
+        # a run without a simulator has no evaluation, and one that diverged perhaps not the last
+        if key in known and (key in lost or key not in scored or episodes.get(key, 0) >= run.spec.n_eval_episodes):
+            done.add(run.key)
+    return done
 
 
 def done_keys(rows: pd.DataFrame) -> set[tuple[Any, ...]]:
@@ -180,7 +205,7 @@ def read_rows(path: Path) -> pd.DataFrame:
     text = {name: str for name in COLUMNS if name not in ("n_updates", "seed", "step", "value")}
     try:
         rows = pd.read_csv(path, dtype=text, compression="gzip", keep_default_na=False, na_values={"value": [""]})
-    except (OSError, EOFError, ValueError) as error:
+    except (OSError, EOFError, ValueError, zlib.error) as error:
         raise ResultsError(
             f"the file cannot be read: {error}", where=str(path), hint="Take it from the repository."
         ) from error

@@ -57,6 +57,9 @@ def execute(
     after = [(run.spec, Path(run.needs)) for run in wanted.values() if run.needs is not None]
     device = get_device(device)
     failures = _run_all(first, workers, device, ray_address, console)
+    without = [best_policy for _, best_policy in after if read_divergence(best_policy) is not None]
+    failures += [DivergenceError(f"the probe needs the last policy of {path.name}, which diverged") for path in without]
+    after = [(spec, best_policy) for spec, best_policy in after if best_policy not in without]
     for spec, best_policy in after:
         prepare_probe(spec, best_policy)
     # A probe begins from a file on this machine, and is one model with five sets of critics: never batched.

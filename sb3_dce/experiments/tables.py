@@ -7,11 +7,12 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from sb3_dce.experiments.evidence import Evidence
+from sb3_dce.experiments.evidence import Evidence, at_end, curve_of
 from sb3_dce.experiments.grid import Variant, source_of
 from sb3_dce.experiments.paper import paper_score, paper_scores
 from sb3_dce.experiments.statistics import (
@@ -215,15 +216,16 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
             (
                 variant.name,
                 *(f"{sums.mean:.1f}", *spreads, f"{mean_of_tasks(scores):.1f}", f"{iqm(scores):.1f}"),
-                f"{low:.1f} to {high:.1f}",
+                f"{low:.1f} to {high:.1f}" if all(len(task) > 1 for task in scores) else "-",
                 chance,
                 str(sum(len(task) for task in scores)),
                 f"{sum(known):.1f}" if len(known) == len(printed) else "-",
             )
         )
     note = (
-        f"Over the {len(ids)} data sets on which all agents have runs. The interval is a stratified bootstrap over seeds "
-        "within data sets (2,000 resamples); the deviation of the total takes the rows as independent."
+        f"Over the {len(ids)} data sets on which all of these agents have runs of one length. The interval is a stratified "
+        "bootstrap over seeds within data sets (2,000 resamples; none with one seed); the deviation of the total takes the "
+        "rows as independent."
     )
     return TextTable(header, tuple(rows), f"{evidence.caption(ids, variants)} {note}")
 
@@ -261,6 +263,42 @@ def seconds_per_1000(evidence: Evidence, variant: Variant, dataset_ids: list[str
     return np.concatenate(rates) if rates else np.empty(0)
 
 
+class RunTime(NamedTuple):
+    """
+    :param seconds: per 1000 updates
+    :param device: and precision
+    :param hastened: whether rounded products or settings of the scale make it faster than the authors' agent in float32
+    """
+
+    seconds: float
+    device: str
+    hastened: bool
+
+    @property
+    def text(self) -> str:
+        """
+        :return: seconds and device
+        """
+        return f"{self.seconds:.1f} s ({self.device}{', fewer draws' if self.hastened and ' ' not in self.device else ''})"
+
+
+def fastest_run(evidence: Evidence, variant: Variant, dataset_ids: list[str]) -> RunTime | None:
+    """
+    :param evidence: of an experiment with a table
+    :param variant: agent
+    :param dataset_ids: data
+    :return: the run that others disturbed least, of those that were trained alone in float32 if there are any
+    """
+    runs = []
+    for name in dataset_ids:
+        for rows in (evidence.runs(variant, name), evidence.of_other_length(variant, name)):
+            alone = rows[(rows["metric"] == "seconds") & ~rows["device"].str.contains("population")]
+            reduced = "n_mc_dropout" in evidence.scale.set_for.get(variant.algo, {})
+            for value, n_updates, device in zip(alone["value"], alone["n_updates"], alone["device"], strict=True):
+                runs.append(RunTime(1000.0 * value / n_updates, device, reduced or " " in device))
+    return min(runs, key=lambda run: (" " in run.device, run.seconds), default=None)
+
+
 def long_table(evidence: Evidence) -> TextTable:
     """
     :param evidence: rows
@@ -274,24 +312,24 @@ def long_table(evidence: Evidence) -> TextTable:
     rows = []
     for dataset, name in evidence.table_rows():
         for variant in evidence.variants(dataset):
-            scores = evidence.last(variant, name)
-            lost = evidence.n_diverged(variant, name)
+            runs = evidence.runs(variant, name)
+            runs = runs if len(runs) else evidence.of_other_length(variant, name)
+            scores, lost = at_end(runs, "score"), int((runs["metric"] == "diverged").sum())
             if not len(scores) and not lost:
                 continue
             numbers = ["", "", "", "", "", "", "", ""]
             if len(scores):
-                low, high = bootstrap_interval([scores])
-                few = evidence.last(variant, name, "score_paper_episodes")
-                curve = evidence.curve(variant, name, "score")
+                low, high = bootstrap_interval([scores]) if len(scores) > 1 else (float("nan"), float("nan"))
+                few = at_end(runs, "score_paper_episodes")
+                curve = curve_of(runs, "score")
                 paper_mode = float(few.mean()) if len(few) else float("nan")
                 late = (float(curve.tail(10).mean().mean()), float(curve.max().mean()))
                 values = (float(scores.mean()), sample_std(scores), low, high, paper_mode, *late)
-                numbers = [f"{v:.4f}" for v in values] + [" ".join(f"{s:.4f}" for s in scores)]
+                numbers = ["" if np.isnan(v) else f"{v:.4f}" for v in values] + [" ".join(f"{s:.4f}" for s in scores)]
             paper = evidence.paper_id(dataset)
             cell = None if variant.paper is None else paper_score(paper, variant.paper)
             printed = ["" if v is None else f"{v:g}" for v in ((None, None) if cell is None else (cell.score, cell.std))]
-            settings = evidence.runs(variant, name)["hyperparameters"].iloc[0]
-            length = str(evidence.n_updates(name))
+            settings, length = runs["hyperparameters"].iloc[0], str(runs["n_updates"].iloc[0])
             start = [name, source_of(name), variant.name, settings, length, str(len(scores)), str(lost)]
             rows.append((*start, *numbers, paper, *printed))
     return TextTable(header, tuple(rows), "")
