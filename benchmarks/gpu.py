@@ -50,7 +50,7 @@ def main() -> None:
     """Measure, write, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rows", type=int, default=1_000_000)
-    parser.add_argument("--seconds", type=float, default=4.0)
+    parser.add_argument("--seconds", type=float, default=2.0)
     parser.add_argument("--members", default="5,20,60")
     parser.add_argument("--device", default="cuda", help="only to try the script: 'cpu' says nothing")
     parser.add_argument("--out", type=Path, default=RESULTS / "gpu")
@@ -60,34 +60,45 @@ def main() -> None:
     if options.device == "cpu":
         th.cuda.synchronize = lambda: None  # type: ignore[assignment]
 
+    device = th.cuda.get_device_name() if options.device == "cuda" else "cpu"
+    facts = {**machine(), "device": device, "date": time.strftime("%Y-%m-%d"), "rows": options.rows}
     transitions = Transitions.from_arrays(**make_arrays(options.rows))
     common: dict[str, Any] = {"env": make_env(), "dataset": transitions, "batch_size": BATCH, "seed": 0}
     results: dict[str, list[float]] = {}
 
-    def measured(name: str, train: Callable[[int], None]) -> None:
-        results[name] = updates_per_second(train, options.seconds)
+    def measured(name: str, train: Callable[[int], None], members: int = 1) -> None:
+        results[name] = [members * rate for rate in updates_per_second(train, options.seconds)]
         print(f"  {name}: {max(results[name]):,.0f} updates/s", flush=True)
+        write(options.out, facts, results)  # at once: the time on the device may end
 
     sac = filled_sac(transitions, options.device)
     measured("SAC.train of Stable-Baselines3", lambda n: sac.train(n, BATCH))
     for precision in ("float32", "tf32"):
         for execution in ("eager", "compile", "cudagraph") if precision == "float32" else ("cudagraph",):
             model = OfflineDCE("MlpPolicy", execution=execution, precision=precision, device=options.device, **common)
-            measured(f"DCE, {execution}, {precision}", lambda n, model=model: model.train(n, BATCH))
+            name = f"DCE, {execution}, {precision}"
+            measured(name, lambda n, model=model: model.train(n, BATCH))
+            assert model._engine is not None
+            facts.setdefault("run as", {})[name] = model._engine.execution  # the compiler may have failed
         for k in map(int, options.members.split(",")):
             members = [
                 OfflineDCE("MlpPolicy", precision=precision, device="cpu", **{**common, "seed": seed}) for seed in range(k)
             ]
             population = Population(members, options.device, "cudagraph")
-            name = f"{k} x DCE, cudagraph, {precision}"
-            measured(name, lambda n, p=population: p.train(n))
-            results[name] = [k * rate for rate in results[name]]
+            measured(f"{k} x DCE, cudagraph, {precision}", lambda n, p=population: p.train(n), k)
             del population, members
+    print(write(options.out, facts, results))
 
-    device = th.cuda.get_device_name() if options.device == "cuda" else "cpu"
-    facts = {**machine(), "device": device, "date": time.strftime("%Y-%m-%d"), "rows": options.rows}
+
+def write(out: Path, facts: dict[str, Any], results: dict[str, list[float]]) -> str:
+    """
+    :param out: files without ending
+    :param facts: machine, versions, settings
+    :param results: member-updates per second of each repeat, by name
+    :return: Markdown, also written
+    """
     lines = [
-        f"# Updates per second on {device}",
+        f"# Updates per second on {facts['device']}",
         "",
         f"PyTorch {facts['torch']}, {facts['date']}; batch {BATCH}, 256-256 networks, random numbers of HalfCheetah's shape. "
         "Best of three repeats; a population counts the updates of all members.",
@@ -97,11 +108,11 @@ def main() -> None:
         *(f"| {name} | {max(rates):,.0f} | {min(rates):,.0f} - {max(rates):,.0f} |" for name, rates in results.items()),
     ]
     text = "\n".join(lines) + "\n"
-    options.out.parent.mkdir(parents=True, exist_ok=True)
+    out.parent.mkdir(parents=True, exist_ok=True)
     document = json.dumps({"facts": facts, "rates": results}, indent=1)
-    options.out.with_suffix(".json").write_text(document + "\n", encoding="utf-8")
-    options.out.with_suffix(".md").write_text(text, encoding="utf-8")
-    print(text)
+    out.with_suffix(".json").write_text(document + "\n", encoding="utf-8")
+    out.with_suffix(".md").write_text(text, encoding="utf-8")
+    return text
 
 
 if __name__ == "__main__":

@@ -212,6 +212,8 @@ def machine() -> dict[str, Any]:
     """
     :return: what the figures depend on
     """
+    from sb3_dce import __version__
+
     cpuinfo = Path("/proc/cpuinfo")
     names = [line.partition(":")[2].strip() for line in cpuinfo.read_text().splitlines() if line.startswith("model name")]
     return {
@@ -220,7 +222,8 @@ def machine() -> dict[str, Any]:
         "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
         "system": platform.platform(terse=True),
         "python": platform.python_version(),
-        **{name: version(name) for name in ("numpy", "h5py", "pandas", "torch", "stable_baselines3", "sb3_dce")},
+        **{name: version(name) for name in ("numpy", "h5py", "pandas", "torch", "stable_baselines3")},
+        "sb3_dce": __version__,  # which need not be installed
     }
 
 

@@ -285,7 +285,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         if self._generator is None:
             self._generator = th.Generator(device=self.device)
             try:
-                self._generator.set_state(self.rng_state)
+                self._generator.set_state(self.rng_state.cpu())  # loading a model puts it on the model's device
             except RuntimeError:  # saved on another kind of device
                 self._generator.manual_seed(0 if self.seed is None else self.seed)
         return self._generator
@@ -332,7 +332,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         for name, storage in engine.state.storages.items():
             storage.set_learning_rate(rates.get(f"{name}_learning_rate", rates["learning_rate"]))
         assert buffer.rows is not None
-        source = (buffer.rows.data_ptr(), buffer.size(), batch_size)
+        source = (buffer.rows.data_ptr(), buffer.size(), batch_size, self.precision, tuple(specs.items()))
 
         def draw() -> tuple[ReplayBufferSamples, dict[str, th.Tensor]]:
             indices = th.randint(buffer.size(), (batch_size,), generator=generator, device=self.device)

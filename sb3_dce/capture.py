@@ -100,6 +100,13 @@ class CapturedStep:
         """
         return self._generator is generator and all(coef[name] is tensor for name, tensor in self._coef.items())
 
+    @property
+    def is_captured(self) -> bool:
+        """
+        :return: False while it is being warmed up
+        """
+        return self._graph is not None
+
     def replay(self) -> None:
         """
         One update.

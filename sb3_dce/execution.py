@@ -148,7 +148,7 @@ class Engine(Generic[S]):
                     self._captured.pop((key, None), None)
                     inputs = self._inputs[key] = StaticInputs.like(batch, noise)
                 inputs.fill(batch, noise)
-                self._captured_step(key, lambda: inputs, coef).replay()
+                self._replay(self._captured_step(key, lambda: inputs, coef))
 
     def step_drawn(
         self, draw: Draw, coef: dict[str, th.Tensor], generator: th.Generator | None, source: Hashable, **variant: Any
@@ -166,7 +166,15 @@ class Engine(Generic[S]):
             self.step(*draw(), coef, **variant)
             return
         with th.no_grad():
-            self._captured_step(tuple(sorted(variant.items())), draw, coef, generator, source).replay()
+            self._replay(self._captured_step(tuple(sorted(variant.items())), draw, coef, generator, source))
+
+    @staticmethod
+    def _replay(captured: CapturedStep) -> None:
+        if captured.is_captured:
+            captured.replay()
+        else:
+            with _room_for_compiled_updates():
+                captured.replay()
 
     @contextlib.contextmanager
     def _guards_evaluated_once(self, key: Variant, batch: Any) -> Iterator[None]:
@@ -190,17 +198,24 @@ class Engine(Generic[S]):
         return self._compiled[key]
 
     def _guarded(self, compiled: Step, key: Variant) -> Step:
-        """The first call compiles; any failure of the compiler is no reason to stop, since eager computes the same."""
+        """The first call compiles; any failure of the compiler is no reason to stop, since uncompiled it computes the same."""
 
         def first_call(*arguments: Any) -> dict[str, th.Tensor]:
+            if self._compiled[key] is not first_call:  # a captured step keeps calling this
+                return self._compiled[key](*arguments)
             try:
                 with _room_for_compiled_updates():
                     metrics = compiled(*arguments)
                 self._compiled[key] = compiled
             except Exception as error:
-                warnings.warn(f"compiling the update failed, running eager: {str(error).splitlines()[0]}", SB3DCEWarning)
-                self.execution = "eager"
-                metrics = self._in_place(dict(key))(*arguments)
+                if th.cuda.is_available() and th.cuda.is_current_stream_capturing():
+                    raise  # whatever would follow could not become part of this capture
+                way = "capturing it as it is" if self.execution == "cudagraph" else "running eager"
+                warnings.warn(f"compiling the update failed, {way}: {str(error).splitlines()[0]}", SB3DCEWarning)
+                self._compiled[key] = self._in_place(dict(key))
+                if self.execution == "compile":
+                    self.execution = "eager"
+                metrics = self._compiled[key](*arguments)
             return metrics
 
         return first_call

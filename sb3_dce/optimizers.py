@@ -7,6 +7,7 @@ compiled or captured step never bakes in a number that changes.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -90,11 +91,12 @@ def adam_step(learner: Learner, gradient: th.Tensor, learning_rate: th.Tensor, s
     step = learner.step + 1.0
     exp_avg = th.lerp(learner.exp_avg, gradient, 1.0 - settings.beta1)
     exp_avg_sq = settings.beta2 * learner.exp_avg_sq + (1.0 - settings.beta2) * gradient.square()
-    # In float64 whatever the parameters' dtype: 1 - beta2^step loses half its digits in float32 at the start.
-    exact_step = step.double()
-    step_size = learning_rate / (1.0 - settings.beta1**exact_step)
-    root_correction = (1.0 - settings.beta2**exact_step).sqrt()
-    # Stacked, since a stack is computed once: the compiler would otherwise take both powers again for every few parameters.
-    step_size, root_correction = th.stack([step_size, root_correction]).to(params.dtype).unbind()
+    # expm1, since 1 - beta2^step loses half its digits in float32 at the start.
+    n = step.to(params.dtype)
+    step_size = learning_rate / -th.expm1(n * math.log(settings.beta1))
+    root_correction = (-th.expm1(n * math.log(settings.beta2))).sqrt()
+    # Stacked, since on a processor a stack is computed once: the compiler would otherwise take both again for every few
+    # parameters. On a GPU it may, which is why this is not done in float64.
+    step_size, root_correction = th.stack([step_size, root_correction]).unbind()
     params = params - step_size * exp_avg / (exp_avg_sq.sqrt() / root_correction + settings.eps)
     return Learner(params, exp_avg, exp_avg_sq, step)

@@ -100,6 +100,7 @@ class Population:
         self._generator = th.Generator(device=self.device)
         self._generator.manual_seed(seed)
         self._coef: dict[str, th.Tensor] = {}
+        self._coef_values: dict[str, list[float]] = {}
         self._coef_hold_until = 0
         self._engine: Engine[StackedState] | None = None
 
@@ -136,10 +137,11 @@ class Population:
 
         # what each member draws for itself comes from its model, on the processor
         on_device = None if self.own_randomness else self._generator
+        source = (first.batch_size, first.precision, tuple(specs.items()))
         with matmul_precision(first.precision, self.device):
             for _ in range(n_updates):
                 coef, variant = self._coefficients(total), first.update_variant(self._n_updates)
-                engine.step_drawn(draw, coef, on_device, first.batch_size, **variant)
+                engine.step_drawn(draw, coef, on_device, source, **variant)
                 self._n_updates += 1
                 if first.reads_state_after(self._n_updates):
                     for index, model in enumerate(self.models):
@@ -150,7 +152,7 @@ class Population:
 
     def _bound_engine(self, planned_updates: int) -> Engine[StackedState]:
         if self._engine is None:
-            template = _template(self.models[0])
+            template = _template(self.models[0], self.device)
             update = template.make_update(self._storages[0])
 
             def together(state: Any, batch: Any, noise: Any, coef: Any, **variant: Any) -> Any:
@@ -199,11 +201,15 @@ class Population:
             model._update_current_progress_remaining(self._n_updates, total)
         members = [model.coefficients(self._n_updates) for model in self.models]
         for name in members[0]:
-            values = th.tensor([member[name] for member in members], dtype=self._dtype, device=self.device)
+            values = [member[name] for member in members]
+            if self._coef_values.get(name) == values:
+                continue  # a copy to a GPU waits for all that it has to do
+            tensor = th.tensor(values, dtype=self._dtype, device=self.device)
             if name in self._coef:
-                self._coef[name].copy_(values)  # in place: a compiled or captured step reads this very tensor
+                self._coef[name].copy_(tensor)  # in place: a compiled or captured step reads this very tensor
             else:
-                self._coef[name] = values
+                self._coef[name] = tensor
+            self._coef_values[name] = values
         self._coef_hold_until = min(model.coefficients_hold_until(self._n_updates) for model in self.models)
         return self._coef
 
@@ -336,12 +342,12 @@ def _standardization(models: Sequence[OfflineAlgorithm], device: th.device) -> t
     return mean.to(device), th.stack([extractor.std + extractor.eps for extractor in extractors]).to(device)
 
 
-def _template(model: OfflineAlgorithm) -> OfflineAlgorithm:
+def _template(model: OfflineAlgorithm, device: th.device) -> OfflineAlgorithm:
     """The model whose networks state the update: a copy, with observations that are standardised already left alone."""
     if not model.normalize_obs:
         return model
     template = copy.copy(model)
-    template.policy = copy.deepcopy(model.policy)
+    template.policy = copy.deepcopy(model.policy).to(device)  # what is no parameter is read from the networks
     for name in model.networks:
         setattr(template, name, getattr(template.policy, name))
     for module in template.policy.modules():

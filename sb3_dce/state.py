@@ -98,8 +98,11 @@ class Storage:
 
     def _bind(self) -> None:
         self.params = _flatten([p.detach() for p in self._parameters])
+        self._pointers = []
+        self._moment_pointers: list[int] = []
         for parameter, view in self._views(self.params):
             parameter.data = view
+            self._pointers.append(view.data_ptr())
         if self._optimizer is None:
             return
         saved = [self._optimizer.state.get(p, {}) for p in self._parameters]
@@ -110,6 +113,7 @@ class Storage:
         self.step = th.tensor(max(steps), dtype=th.float32, device=self.params.device)
         for (parameter, first), (_, second) in zip(self._views(self.exp_avg), self._views(self.exp_avg_sq), strict=True):
             self._optimizer.state[parameter] = {"step": self.step, "exp_avg": first, "exp_avg_sq": second}
+            self._moment_pointers.append(first.data_ptr())
 
     def _views(self, flat: th.Tensor) -> list[tuple[th.Tensor, th.Tensor]]:
         pieces = flat.split([p.numel() for p in self._parameters])
@@ -120,14 +124,15 @@ class Storage:
         :return: whether the parameters and moments are still views of this storage; ``load_state_dict`` of an optimizer,
             ``module.to(...)`` and Stable-Baselines3's ``load`` put other tensors in their place
         """
-        if any(p.data_ptr() != view.data_ptr() or p.dtype != view.dtype for p, view in self._views(self.params)):
+        # asked before every update of ``learn``, so by addresses that are known instead of by views made anew
+        if any(p.data_ptr() != address for p, address in zip(self._parameters, self._pointers, strict=True)):
             return False
         if self._optimizer is None:
             return True
         state = self._optimizer.state
         return all(
-            p in state and state[p]["exp_avg"].data_ptr() == view.data_ptr() and state[p]["step"] is self.step
-            for p, view in self._views(self.exp_avg)
+            p in state and state[p]["exp_avg"].data_ptr() == address and state[p]["step"] is self.step
+            for p, address in zip(self._parameters, self._moment_pointers, strict=True)
         )
 
     def set_learning_rate(self, learning_rate: float) -> None:

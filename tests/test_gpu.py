@@ -113,6 +113,28 @@ def test_population_members_equal_runs_on_the_processor(execution: str, transiti
         assert largest_difference(all_tensors(single), all_tensors(member)) <= 1e-9
 
 
+@pytest.mark.parametrize("normalize_obs", [False, True])
+def test_population_that_draws_on_the_device_is_captured_with_its_draws(normalize_obs: bool, transitions: Transitions) -> None:
+    members = []
+    for execution in ("eager", "cudagraph"):
+        models = [make(transitions, normalize_obs=normalize_obs, seed=s, beta=1.0 + s, device="cpu") for s in range(3)]
+        population = Population(models, "cuda", execution)
+        for _ in range(3):
+            population.train(10)
+        members.append([all_tensors(model) for model in population.commit()])
+    for eager, captured in zip(*members, strict=True):
+        assert largest_difference(eager, captured) <= 1e-10
+    assert largest_difference(*members[1][:2]) > 1e-3, "each member has rows and noise of its own"
+
+
+def test_precision_that_is_changed_is_captured_anew(transitions: Transitions) -> None:
+    model = make(transitions, execution="cudagraph")
+    model.train(5, 8)
+    model.precision = "tf32"
+    model.train(5, 8)
+    assert len(model._engine._captured) == 2
+
+
 def test_tf32_is_switched_on_for_training_only(transitions: Transitions) -> None:
     before = th.backends.cuda.matmul.fp32_precision
     kwargs = {**SMALL, "batch_size": 64, "policy_kwargs": {"net_arch": [64, 64]}}

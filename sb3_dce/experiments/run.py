@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import hashlib
+import traceback
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -100,7 +102,11 @@ def _run_all(
             # its traceback would keep the whole population on the device while the next ones are trained
             failures.append(error.with_traceback(None))
         except Exception as error:
+            traceback.clear_frames(error.__traceback__)  # they hold the population, too
             failures.append(error)
+        # a population refers to itself: it would stay on the device until a collection that comes by chance
+        gc.collect()
+        th.cuda.empty_cache()
     return failures
 
 
