@@ -125,6 +125,16 @@ def test_totals_have_the_papers_sum_of_deviations_beside_the_honest_one() -> Non
     assert cell(table, "CQL", "paper: total of these rows") == "131.0", "72.5 and 58.5"
 
 
+def test_adroit_and_kitchen_have_totals_of_their_own() -> None:
+    adroit = load_experiment("table-adroit-kitchen")
+    rows = table_rows(adroit, {"door-human-v0": {"BC": [10.0], "PBRL": [5.0]}, "kitchen-mixed-v0": {"BC": [50.0]}})
+    tables = aggregate_tables(evidence_of(rows, "table-adroit-kitchen"))
+    assert sorted(tables) == ["D4RL-adroit", "D4RL-kitchen"]
+    assert cell(tables["D4RL-kitchen"], "BC", "total") == "50.0" and len(tables["D4RL-kitchen"].rows) == 1
+    assert cell(tables["D4RL-adroit"], "BC", "total") == "10.0" and len(tables["D4RL-adroit"].rows) == 2
+    assert cell(tables["D4RL-adroit"], "BC", "95 % interval of the IQM") == "-", "one seed has no interval"
+
+
 def test_captions_name_data_hash_length_seeds_and_code() -> None:
     caption = evidence_of(table_rows(TABLE, {CHEETAH: scores()})).caption([CHEETAH])
     for part in (f"`{CHEETAH}` (made with this package, not D4RL's; sha256 {SHA[:8]}…)", "Gradient steps: 1,000", "seeds: 3"):

@@ -54,12 +54,12 @@ def draw(evidence: Evidence, folder: Path, name: str) -> list[Path]:
     return _save(figure, folder, name)
 
 
-def draw_profile(evidence: Evidence, source: str, folder: Path, name: str) -> list[Path]:
+def draw_profile(evidence: Evidence, part: str, folder: Path, name: str) -> list[Path]:
     """
     Performance profile: the share of runs above a score, over the data on which all agents have runs.
 
     :param evidence: of a table
-    :param source: "D4RL" or "sb3", never both
+    :param part: of the table, one of :func:`~sb3_dce.experiments.tables.parts_of`
     :param folder: where the pictures are written
     :param name: of the files, without ending
     :return: PNG and SVG file
@@ -67,7 +67,7 @@ def draw_profile(evidence: Evidence, source: str, folder: Path, name: str) -> li
     """
     figure = _figure(1.5 * WIDTH, HEIGHT)
     axes = figure.add_subplot()
-    ids = common_rows(evidence, source)
+    ids = common_rows(evidence, part)
     scores = {v.name: [evidence.last(v, i) for i in ids] for v in evidence.experiment.variants if v.datasets is None}
     scores = {agent: tasks for agent, tasks in scores.items() if all(len(task) for task in tasks)}
     every = np.concatenate([task for tasks in scores.values() for task in tasks])
@@ -76,7 +76,7 @@ def draw_profile(evidence: Evidence, source: str, folder: Path, name: str) -> li
         share = performance_profile(tasks, thresholds)
         axes.step(thresholds, share, color=f"C{number}", linewidth=1.4, label=agent)
     axes.set(xlabel="normalised score", ylabel="share of runs above it", ylim=(-0.02, 1.02))
-    axes.set_title(f"{len(ids)} data sets, {'D4RL' if source == 'D4RL' else 'made with this package'}", fontsize=10)
+    axes.set_title(f"{len(ids)} data sets, {'D4RL' if part.startswith('D4RL') else 'made with this package'}", fontsize=10)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=7)
     return _save(figure, folder, name)

@@ -9,14 +9,17 @@ from pathlib import Path
 from sb3_dce.experiments.claims import claim_table, own_table_facts
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.reports import Report, count
-from sb3_dce.experiments.tables import TextTable
+from sb3_dce.experiments.tables import TextTable, parts_of
 from sb3_dce.experiments.verdicts import Verdict
 from sb3_dce.files import write_atomically
 
 HEADINGS = {
     "scores": "Normalised scores",
-    "aggregates-D4RL": "Aggregates, D4RL's data",
-    "aggregates-sb3": "Aggregates, our own data",
+    **{
+        f"aggregates-{source}{ending}": f"Aggregates, {whose} data{where}"
+        for source, whose in (("D4RL", "D4RL's"), ("sb3", "our own"))
+        for ending, where in (("", ""), ("-adroit", ": Adroit"), ("-kitchen", ": Kitchen"))
+    },
     "run-times": "Run times",
     "bounds": "Bounds (Eq. 14 to 17)",
     "claim-4.3": "Claim 4.3 on a linear critic",
@@ -63,9 +66,9 @@ def _section(name: str, evidence: Evidence, report: Report, link: str) -> list[s
     for table_name, table in report.tables.items():
         if table_name in HEADINGS:
             parts += [f"### {HEADINGS[table_name]}", table.markdown()]
-    for source in ("D4RL", "sb3"):
-        if f"aggregates-{source}" in report.tables:
-            parts += ["### Performance profile", f"![Performance profile]({link}figures/{name}-profile-{source}.png)"]
+    for part in parts_of(evidence):
+        if f"aggregates-{part}" in report.tables:
+            parts += ["### Performance profile", f"![Performance profile]({link}figures/{name}-profile-{part}.png)"]
             parts += ["Share of all runs above a score, over the data of the aggregates above."]
     if report.has_figure:
         parts += [f"![{experiment.title}]({link}figures/{name}.png)", report.caption]

@@ -58,7 +58,7 @@ def make_report(evidence: Evidence) -> Report:
     judged = verdicts(evidence)
     if kind == "table":
         found["scores"] = tables.score_table(evidence)
-        found |= {f"aggregates-{source}": table for source, table in tables.aggregate_tables(evidence).items()}
+        found |= {f"aggregates-{part}": table for part, table in tables.aggregate_tables(evidence).items()}
         found["run-times"] = tables.runtime_table(evidence)
         found["long"] = tables.long_table(evidence)
         judged.append(reproduction(evidence))

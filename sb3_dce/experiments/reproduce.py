@@ -33,6 +33,7 @@ from sb3_dce.experiments.grid import (
 from sb3_dce.experiments.pages import write_page
 from sb3_dce.experiments.reports import Report, count, make_report
 from sb3_dce.experiments.run import execute, is_complete
+from sb3_dce.experiments.tables import parts_of
 from sb3_dce.hyperparams import did_you_mean, full_name
 from sb3_dce.precision import PRECISIONS
 from sb3_dce.runs import RunSpec
@@ -284,9 +285,9 @@ def _report(evidence: Evidence, out: Path, console: Console) -> Report:
         written += table.write(out / "tables", f"{experiment.id}-{name}", endings)
         if name != "long":
             _show(name, table.header, table.rows, console)
-    for source in ("D4RL", "sb3"):
-        if f"aggregates-{source}" in report.tables:
-            written += draw_profile(evidence, source, out / "figures", f"{experiment.id}-profile-{source}")
+    for part in parts_of(evidence):
+        if f"aggregates-{part}" in report.tables:
+            written += draw_profile(evidence, part, out / "figures", f"{experiment.id}-profile-{part}")
     if report.has_figure:
         written += draw(evidence, out / "figures", experiment.id)
         console.print(report.caption, markup=False)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from sb3_dce.data.catalog import resolve
 from sb3_dce.experiments.evidence import Evidence, at_end, curve_of
 from sb3_dce.experiments.grid import Variant, source_of
 from sb3_dce.experiments.paper import paper_score, paper_scores
@@ -161,39 +162,52 @@ def _paper_cell(dataset: str, method: str) -> str:
     return f"**{text}**" if cell.bold else text
 
 
-def common_rows(evidence: Evidence, source: str) -> list[str]:
+def parts_of(evidence: Evidence) -> list[str]:
+    """
+    :param evidence: of an experiment with a table
+    :return: what totals are formed over, never over two of them: "D4RL" and "sb3", with a family behind if there are several
+    """
+    families = list(dict.fromkeys(resolve(dataset.paper).family for dataset in evidence.experiment.datasets))
+    endings = [f"-{family}" for family in families] if len(families) > 1 else [""]
+    return [f"{source}{ending}" for source in ("D4RL", "sb3") for ending in endings]
+
+
+def common_rows(evidence: Evidence, part: str) -> list[str]:
     """
     :param evidence: rows
-    :param source: "D4RL" or "sb3": totals are never formed over both
-    :return: data of this source on which every agent has a score
+    :param part: one of :func:`parts_of`
+    :return: data of this part on which every agent that has runs in it has a score
     """
-    variants = [v for v in evidence.experiment.variants if v.datasets is None]
-    return [
-        name
-        for _, name in evidence.table_rows()
-        if source_of(name) == source and all(len(evidence.last(v, name)) for v in variants if _has_any(evidence, v))
-    ]
+    ids = _rows_of_part(evidence, part)
+    variants = [v for v in evidence.experiment.variants if v.datasets is None and _has_any(evidence, v, ids)]
+    return [name for name in ids if all(len(evidence.last(v, name)) for v in variants)]
 
 
-def _has_any(evidence: Evidence, variant: Variant) -> bool:
-    return any(len(evidence.last(variant, name)) for _, name in evidence.table_rows())
+def _rows_of_part(evidence: Evidence, part: str) -> list[str]:
+    source, _, family = part.partition("-")
+    rows = [name for _, name in evidence.table_rows() if source_of(name) == source]
+    return [name for name in rows if not family or resolve(name).family == family]
+
+
+def _has_any(evidence: Evidence, variant: Variant, ids: list[str]) -> bool:
+    return any(len(evidence.last(variant, name)) for name in ids)
 
 
 def aggregate_tables(evidence: Evidence) -> dict[str, TextTable]:
     """
     :param evidence: of an experiment with a table
-    :return: by source ("D4RL", "sb3") totals, interquartile means and probabilities of improvement
+    :return: by part of :func:`parts_of` totals, interquartile means and probabilities of improvement
     """
     tables = {}
-    for source in ("D4RL", "sb3"):
-        ids = common_rows(evidence, source)
+    for part in parts_of(evidence):
+        ids = common_rows(evidence, part)
         if ids:
-            tables[source] = _aggregate_table(evidence, ids)
+            tables[part] = _aggregate_table(evidence, ids)
     return tables
 
 
 def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
-    variants = [v for v in evidence.experiment.variants if v.datasets is None and _has_any(evidence, v)]
+    variants = [v for v in evidence.experiment.variants if v.datasets is None and _has_any(evidence, v, ids)]
     dce = next((v for v in variants if v.name == "DCE"), None)
     paper_rows = [evidence.paper_id(dataset) for dataset, name in evidence.table_rows() if name in ids]
     header = (
