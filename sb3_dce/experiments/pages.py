@@ -72,6 +72,8 @@ def _section(name: str, evidence: Evidence, report: Report, link: str) -> list[s
             parts += ["Share of all runs above a score, over the data of the aggregates above."]
     if report.has_figure:
         parts += [f"![{experiment.title}]({link}figures/{name}.png)", report.caption]
+    elif experiment.panels:
+        parts.append("Not run.")
     if report.verdicts:
         parts.append(verdict_table(report.verdicts).markdown())
     if "long" in report.tables:

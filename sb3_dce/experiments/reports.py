@@ -35,7 +35,7 @@ COMMON = (
 class Report(NamedTuple):
     """
     :param tables: by name
-    :param has_figure: whether its panels are to be drawn
+    :param has_figure: whether there is anything to draw in its panels
     :param caption: of the figure
     :param verdicts: on the paper's claims
     """
@@ -72,7 +72,7 @@ def make_report(evidence: Evidence) -> Report:
     elif kind == "configuration":
         found = {"rows": config_table(), "common": common_table()}
         judged = [_config_verdict(found["rows"])]
-    return Report(found, bool(evidence.experiment.panels), caption, judged)
+    return Report(found, bool(evidence.experiment.panels and shown), caption, judged)
 
 
 def reproduction(evidence: Evidence) -> Verdict:
