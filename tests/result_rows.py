@@ -60,3 +60,8 @@ def table_rows(
         for variant, values in columns.items()
         for seed, score in enumerate(values)
     )
+
+
+def keys_of(rows: pd.DataFrame) -> set[tuple[object, ...]]:
+    """Dataset, agent, configuration, length and seed of every run."""
+    return set(rows[results.PLAN_KEY].itertuples(index=False, name=None))

@@ -17,6 +17,7 @@ import pandas as pd
 import pytest
 import torch as th
 from commands import sb3_dce
+from result_rows import keys_of
 from rich.console import Console
 from update_tools import all_tensors, largest_difference
 
@@ -63,7 +64,7 @@ def test_one_command_trains_reports_and_goes_on(tmp_path: Path) -> None:
     assert "smoke scale: tiny data" in first.stdout and "net_arch" in first.stdout
     assert (tmp_path / "figures" / "fig-cql-return.png").stat().st_size > 10_000
     rows = results.read_folder(tmp_path / "rows")
-    assert len(results.done_keys(rows)) == 2 and set(rows["dataset"]) == {TINY}
+    assert len(keys_of(rows)) == 2 and set(rows["dataset"]) == {TINY}
     made = models(tmp_path)
     again = sb3_dce("reproduce", "fig-cql-return", *arguments)
     assert "2 of them complete" in again.stdout and models(tmp_path) == made, "nothing is trained again"
@@ -77,13 +78,13 @@ def test_runs_known_as_rows_are_neither_trained_nor_counted_twice(tmp_path: Path
     results.write_rows(tmp_path / "kept" / "part.csv.gz", known)
     # both agents are among those of other figures too
     plan = [r for name in ("fig-cql-return", "fig-cql-q") for r in small_plan(name, tmp_path / "two", updates=4)]
-    done = results.done_keys(results.read_folder(tmp_path / "kept"))
+    done = keys_of(results.read_folder(tmp_path / "kept"))
     wanted = [r for r in plan if r.key not in done]
     assert len(plan) == 8 and {r.variant for r in plan} - {r.variant for r in wanted} == {"DCE", "Eq. 18"}
     assert train([r for r in plan if r.key in done], done) == [] and not (tmp_path / "two").exists()
     run(wanted[0].spec)
     new = results.planned_rows(plan)
-    assert len(results.done_keys(results.merge([known, new]))) == 3
+    assert len(keys_of(results.merge([known, new]))) == 3
 
 
 def test_parts_of_a_grid_are_chosen_by_agent_and_seed(tmp_path: Path) -> None:
@@ -160,7 +161,7 @@ def test_run_that_diverges_is_a_result_and_is_not_begun_again(faulty: Faulty) ->
     assert is_complete(faulty.wild.spec)
     assert train([faulty.wild, faulty.good]) == []
     rows = results.planned_rows([faulty.wild, faulty.good])
-    assert set(rows[rows["metric"] == "diverged"]["agent"]) == {"dce"} and len(results.done_keys(rows)) == 2
+    assert set(rows[rows["metric"] == "diverged"]["agent"]) == {"dce"} and len(keys_of(rows)) == 2
 
 
 def test_runs_that_can_be_batched_are_one_population(tmp_path: Path) -> None:
@@ -196,7 +197,7 @@ def test_population_of_a_figure_writes_what_its_processes_would_write(tmp_path: 
     group = max(populations(r.spec for r in plan), key=len)
     BatchedRuns(group, th.device("cpu"), "eager", QUIET, state_file="population-of-dce.pt").run()
     rows = results.planned_rows(plan)
-    assert len(group) == 7 and results.done_keys(rows) == {r.key for r in plan if r.spec.algo == "dce"}
+    assert len(group) == 7 and keys_of(rows) == {r.key for r in plan if r.spec.algo == "dce"}
     assert {"q_data", "gap_td", "score", "seconds"} <= set(rows["metric"])
     assert set(rows["device"]) == {"cpu, population of 7"}
 

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from result_rows import run_rows
+from result_rows import keys_of, run_rows
 
 from sb3_dce.data.catalog import normalized_score
 from sb3_dce.errors import CheckpointError
@@ -59,7 +59,7 @@ def test_rows_of_a_run_hold_its_numbers(finished: Path) -> None:
 
 def test_imported_folder_is_the_run_that_a_grid_asks_for(finished: Path) -> None:
     rows = results.import_runs(finished.parent.parent, "table1")
-    (key,) = results.done_keys(rows)
+    (key,) = keys_of(rows)
     assert key[:2] == (TINY, "dce") and key[3:] == (12, 3)
     assert results.merge([rows, rows]).equals(rows) and results.without(rows, rows).empty
 
@@ -73,13 +73,13 @@ def test_precision_makes_no_other_run_and_stands_beside_the_device(finished: Pat
     plain, rounded = results.rows_of_run(finished, "table1"), results.rows_of_run(tmp_path / "run", "table1")
     assert plain is not None and rounded is not None
     assert set(plain["device"]) == {"cpu"} and set(rounded["device"]) == {"cpu bf16-matmul"}
-    assert results.done_keys(plain) == results.done_keys(rounded)
+    assert keys_of(plain) == keys_of(rounded)
     assert set(rounded["hyperparameters"]) == set(plain["hyperparameters"])
 
 
 def test_rows_count_as_done_on_the_present_file_and_with_enough_episodes(finished: Path) -> None:
     rows = results.import_runs(finished.parent.parent, "table1")
-    ((dataset, agent, config, n_updates, seed),) = results.done_keys(rows)
+    ((dataset, agent, config, n_updates, seed),) = keys_of(rows)
     spec = RunSpec(agent, dataset, seed, n_updates, "folder", 4, 5, QUICK)
     plan = PlannedRun("table1", "DCE", dataset, spec, config)
     assert results.done_runs(rows, [plan]) == {plan.key}

@@ -168,14 +168,6 @@ def done_runs(rows: pd.DataFrame, planned: Iterable[PlannedRun]) -> set[tuple[An
     return done
 
 
-def done_keys(rows: pd.DataFrame) -> set[tuple[Any, ...]]:
-    """
-    :param rows: rows
-    :return: dataset, agent, configuration, length and seed of every run in them
-    """
-    return set(rows[PLAN_KEY].itertuples(index=False, name=None))
-
-
 def empty() -> pd.DataFrame:
     """
     :return: no rows
