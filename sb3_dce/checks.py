@@ -64,6 +64,21 @@ def check_choice(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
         raise ConfigError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}", key=name)
 
 
+def check_ends_with_evaluation(n_updates: int, eval_freq: int, whose: str = "") -> None:
+    """
+    :param n_updates: gradient steps of a run whose last evaluation is its result
+    :param eval_freq: gradient steps between two evaluations
+    :param whose: addition to the message
+    :raises ConfigError: if the last evaluation would not be at the end
+    """
+    if n_updates % eval_freq:
+        raise ConfigError(
+            f"{n_updates} gradient steps{whose} do not end with an evaluation, which there is every {eval_freq}",
+            key="--updates",
+            hint=f"Take a multiple of {eval_freq}, or another --eval-freq.",
+        )
+
+
 def callback_frequencies(callback: BaseCallback) -> list[tuple[str, int]]:
     """
     :param callback: callback, or a list or chain of them

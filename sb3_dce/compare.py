@@ -16,6 +16,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from sb3_dce.agents import agent_class
+from sb3_dce.checks import check_ends_with_evaluation
 from sb3_dce.data import find_file, load_transitions
 from sb3_dce.data.catalog import DatasetSpec, normalized_score
 from sb3_dce.data.locate import short_name
@@ -146,12 +147,7 @@ def _lengths(algos: Sequence[str], n_updates: int, updates_of: Mapping[str, int]
     named = {_one_of(algos, name, "--updates-of"): length for name, length in updates_of.items()}
     lengths = {algo: named.get(algo, n_updates) for algo in algos}
     for algo, length in lengths.items():
-        if length % eval_freq:
-            raise ConfigError(
-                f"{length} gradient steps of {algo} do not end with an evaluation, which there is every {eval_freq}",
-                key="--updates",
-                hint=f"Take a multiple of {eval_freq}, or another --eval-freq.",
-            )
+        check_ends_with_evaluation(length, eval_freq, f" of {algo}")
     return lengths
 
 

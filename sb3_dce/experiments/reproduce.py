@@ -14,7 +14,7 @@ import torch as th
 from rich.console import Console
 from rich.table import Table
 
-from sb3_dce.checks import check_choice
+from sb3_dce.checks import check_choice, check_ends_with_evaluation
 from sb3_dce.data.locking import exclusive
 from sb3_dce.errors import ConfigError
 from sb3_dce.experiments import results
@@ -201,12 +201,7 @@ def scale_of(experiment: Experiment, request: Request) -> Scale:
     scale = experiment.scales[request.scale]
     updates = request.updates or scale.updates
     every = request.eval_freq or min(scale.eval_freq, updates)
-    if updates % every:
-        raise ConfigError(
-            f"{updates} gradient steps do not end with an evaluation, which there is every {every}",
-            key="--updates",
-            hint=f"Take a multiple of {every}, or another --eval-freq.",
-        )
+    check_ends_with_evaluation(updates, every)
     scale = replace(scale, updates=updates, eval_freq=every)
     return scale if request.seeds is None else replace(scale, seeds=request.seeds)
 

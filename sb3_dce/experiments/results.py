@@ -158,10 +158,13 @@ def done_runs(rows: pd.DataFrame, planned: Iterable[PlannedRun]) -> set[tuple[An
     counts = rows[rows["metric"] == "n_episodes"]
     episodes = dict(zip(counts[RUN_KEY].itertuples(index=False, name=None), counts["value"], strict=True))
     known = set(rows[RUN_KEY].itertuples(index=False, name=None))
+    present: dict[str, str] = {}
     done = set()
     for run in planned:
         dataset, *others = run.key
-        key = (dataset, file_sha256(find_file(dataset)[0]), *others)
+        if dataset not in present:  # once for all runs on it: a file can be large
+            present[dataset] = file_sha256(find_file(dataset)[0])
+        key = (dataset, present[dataset], *others)
         # a run without a simulator has no evaluation, and one that diverged perhaps not the last
         if key in known and (key in lost or key not in scored or episodes.get(key, 0) >= run.spec.n_eval_episodes):
             done.add(run.key)

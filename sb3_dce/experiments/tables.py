@@ -271,10 +271,15 @@ def seconds_per_1000(evidence: Evidence, variant: Variant, dataset_ids: list[str
     """
     rates = []
     for name in dataset_ids:
-        rows = pd.concat([evidence.runs(variant, name), evidence.of_other_length(variant, name)])
-        alone = rows[(rows["metric"] == "seconds") & ~rows["device"].str.contains("population")]
+        alone = _timed_alone(evidence, variant, name)
         rates.append(1000.0 * alone["value"].to_numpy(dtype=float) / alone["n_updates"].to_numpy(dtype=float))
     return np.concatenate(rates) if rates else np.empty(0)
+
+
+def _timed_alone(evidence: Evidence, variant: Variant, dataset_id: str) -> pd.DataFrame:
+    """Seconds of each complete run, whatever its length, that was no member of a population."""
+    rows = pd.concat([evidence.runs(variant, dataset_id), evidence.of_other_length(variant, dataset_id)])
+    return rows[(rows["metric"] == "seconds") & ~rows["device"].str.contains("population")]
 
 
 class RunTime(NamedTuple):
@@ -303,13 +308,12 @@ def fastest_run(evidence: Evidence, variant: Variant, dataset_ids: list[str]) ->
     :param dataset_ids: data
     :return: the run that others disturbed least, of those that were trained alone in float32 if there are any
     """
+    reduced = "n_mc_dropout" in evidence.scale.set_for.get(variant.algo, {})
     runs = []
     for name in dataset_ids:
-        for rows in (evidence.runs(variant, name), evidence.of_other_length(variant, name)):
-            alone = rows[(rows["metric"] == "seconds") & ~rows["device"].str.contains("population")]
-            reduced = "n_mc_dropout" in evidence.scale.set_for.get(variant.algo, {})
-            for value, n_updates, device in zip(alone["value"], alone["n_updates"], alone["device"], strict=True):
-                runs.append(RunTime(1000.0 * value / n_updates, device, reduced or " " in device))
+        alone = _timed_alone(evidence, variant, name)
+        for value, n_updates, device in zip(alone["value"], alone["n_updates"], alone["device"], strict=True):
+            runs.append(RunTime(1000.0 * value / n_updates, device, reduced or " " in device))
     return min(runs, key=lambda run: (" " in run.device, run.seconds), default=None)
 
 
