@@ -240,12 +240,14 @@ def _parse_lengths(pairs: list[str]) -> dict[str, int]:
     for pair in pairs:
         name, _, text = pair.partition("=")
         try:
-            lengths[name] = int(float(text))
-        except (ValueError, OverflowError):
-            lengths[name] = 0
-        if not name or lengths[name] < 1:
+            length = float(text)
+        except ValueError:
+            length = 0.0
+        if not name or length < 1 or not length.is_integer():
             hint = "For example --updates-of pbrl=1e4."
-            raise ConfigError(f"--updates-of wants AGENT=UPDATES, got {pair!r}", key="--updates-of", hint=hint)
+            message = f"--updates-of wants AGENT=UPDATES, a whole number of these, got {pair!r}"
+            raise ConfigError(message, key="--updates-of", hint=hint)
+        lengths[name] = int(length)
     return lengths
 
 

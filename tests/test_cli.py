@@ -171,6 +171,7 @@ def test_an_interrupted_run_goes_on_and_ends_like_an_uninterrupted_one(tmp_path:
         (("train", TINY, "--algo", "dse"), ("unknown algorithm 'dse'", "dce")),
         (("compare", "--dataset", TINY, "--updates", "inf"), ("whole number", "inf")),
         (("compare", "--dataset", TINY, "--updates-of", "pbrl"), ("AGENT=UPDATES", "pbrl=1e4")),
+        (("compare", "--dataset", TINY, "--updates-of", "pbrl=1.5"), ("whole number", "pbrl=1.5")),
         (("reproduce", ","), ("no experiment is named", "--list")),
         (("evaluate", "missing.zip"), ("no such file",)),
         (("datasets", "info", "nonsense"), ("nonsense",)),

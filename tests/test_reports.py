@@ -154,15 +154,15 @@ def test_markdown_latex_and_csv_have_the_same_cells() -> None:
 # -- verdicts ------------------------------------------------------------------------------------------------------
 
 
-def beta_rows(factor: float = 1.0, gap: float = 0.01, best: str = "beta 4") -> pd.DataFrame:
-    """Rows in which Q falls by ``factor`` times what theory says, at ten points of 100,000 updates."""
+def beta_rows(factor: float = 1.0, gap: float = 0.01, best: str = "beta 4", wavy: str = "beta 2") -> pd.DataFrame:
+    """Rows in which Q falls by ``factor`` times what theory says, at ten points of 100,000 updates, one beta with a wave."""
     steps = [10_000 * (i + 1) for i in range(10)]
     parts = []
     for variant in BETA.variants:
         unit = 0.0 if "beta" not in variant.set else variant.set["beta"] / (2 * variant.set.get("td_loss_coef", 1.0))
         lowered = [factor * unit * shift_factor(step - 5000, 0.99, 0.005) for step in steps]
         curves = {
-            "q_data": [400.0 - x for x in lowered],
+            "q_data": [400.0 - x + (100.0 if variant.name == wavy and i == 7 else 0.0) for i, x in enumerate(lowered)],
             "value": [399.0 - (x - factor * unit) / 0.99 for x in lowered],
             "gap_td": [gap * unit] * 10,
         }
@@ -173,7 +173,7 @@ def beta_rows(factor: float = 1.0, gap: float = 0.01, best: str = "beta 4") -> p
 
 def test_claims_on_beta_hold_on_rows_made_by_the_theory() -> None:
     judged = verdicts(evidence_of(beta_rows(), "fig-beta"))
-    assert len(judged) == 7 and {verdict.outcome for verdict in judged} == {HELD}
+    assert len(judged) == 8 and {verdict.outcome for verdict in judged} == {HELD}
     assert any("beta 2: 1.00, beta 4: 1.00, beta 8: 1.00" in verdict.numbers for verdict in judged)
 
 
@@ -184,6 +184,7 @@ def test_claims_on_beta_hold_on_rows_made_by_the_theory() -> None:
         ({"factor": -0.1}, "In-data Q falls"),
         ({"gap": 0.5}, "gap_td near zero"),
         ({"best": "beta 8"}, "Beta 8 is too much"),
+        ({"wavy": ""}, "has a large wave"),
     ],
 )
 def test_claims_on_beta_fail_on_rows_that_break_them(change: dict[str, object], claim: str) -> None:
@@ -273,7 +274,7 @@ def test_without_rows_nothing_is_claimed(name: str) -> None:
 
 
 def test_gap_to_the_reference_is_zero_on_rows_made_by_the_theory() -> None:
-    evidence = evidence_of(beta_rows(), "fig-beta")
+    evidence = evidence_of(beta_rows(wavy=""), "fig-beta")
     (panel,) = [p for p in BETA.panels if p.metric == "gap_ref" and p.title is None]
     curves = panel_curves(evidence, panel)
     assert list(curves) == ["beta 2", "beta 4", "beta 8"]

@@ -111,6 +111,22 @@ def _rising(values: dict[str, float] | None) -> bool | None:
     return None if values is None else bool(np.all(np.diff(list(values.values())) > 0))
 
 
+def _second_halves(evidence: Evidence, names: list[str], measure: Callable[[np.ndarray], float]) -> Values:
+    """A measure of the second half of each variant's curve of in-data Q (mean over seeds), where there is a curve."""
+    dataset_id, values = evidence.id_of(None), _scoped(evidence, names)
+    for name in names:
+        curve = None if dataset_id is None else evidence.curve(evidence.experiment.variant(name), dataset_id, "q_data")
+        if curve is not None and len(curve) > 3:
+            values[name] = measure(curve.mean(axis=1).to_numpy()[len(curve) // 2 :])
+    return values
+
+
+def _waviness(curve: np.ndarray) -> float:
+    """Standard deviation about the straight line through a curve: a steady rise or fall is no wave."""
+    steps = np.arange(len(curve))
+    return float(np.std(curve - np.polyval(np.polyfit(steps, curve, 1), steps), ddof=1))
+
+
 TENTH = "means over the last tenth of the run"
 
 
@@ -127,6 +143,7 @@ def _beta(evidence: Evidence) -> list[Verdict]:
     )
     shown.scope = returns.scope if returns else ""
     best = None if returns is None else max(returns, key=returns.__getitem__)
+    waves = _second_halves(evidence, betas, _waviness)
     tests = [
         judge(
             "With beta 0 the agent does badly: below BC",
@@ -147,6 +164,12 @@ def _beta(evidence: Evidence) -> list[Verdict]:
             _text(returns),
         ),
         judge("In-data Q falls as beta rises", f"Q of beta 0 > 2 > 4 > 8 ({TENTH})", _falling(q_values), _text(q_values)),
+        judge(
+            "In-data Q of beta 2 has a large wave",
+            "the curve's second half deviates from a straight line by the largest standard deviation of all betas",
+            None if len(waves) < len(betas) else max(waves, key=waves.__getitem__) == "beta 2",
+            _text(waves, 2),
+        ),
         judge(
             "Q on the data equals r + gamma V - beta_eff (gap_td near zero)",
             f"abs(gap_td) < 0.2 beta_eff for beta 2, 4, 8 ({TENTH})",
@@ -281,12 +304,7 @@ def _cql_q(evidence: Evidence) -> list[Verdict]:
     levels = _values(evidence, ["expectile 0.5", "expectile 0.7", "expectile 0.9"], "q_data")
     rule = f"in-data Q of expectile 0.5 < 0.7 < 0.9 ({TENTH})"
     found = [judge("A higher expectile gives a higher Q (a slacker estimate)", rule, _rising(levels), _text(levels))]
-    dataset_id = evidence.id_of(None)
-    slopes = _scoped(evidence, ["expectile 0.7", "without policy"])
-    for name in ("expectile 0.7", "without policy"):
-        curve = None if dataset_id is None else evidence.curve(evidence.experiment.variant(name), dataset_id, "q_data")
-        if curve is not None and len(curve) > 3:
-            slopes[name] = float(curve.mean(axis=1).iloc[len(curve) // 2 :].std())
+    slopes = _second_halves(evidence, ["expectile 0.7", "without policy"], lambda curve: float(np.std(curve, ddof=1)))
     holds = None if len(slopes) < 2 else slopes["without policy"] < slopes["expectile 0.7"]
     rule = "standard deviation of the curve over its second half is smaller"
     return [*found, judge("Without a policy in the penalty Q is flatter", rule, holds, _text(slopes, 2))]
