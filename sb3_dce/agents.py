@@ -29,7 +29,7 @@ _CLASSES: tuple[type[OfflineAlgorithm], ...] = (
     OfflineUWAC,
 )
 AGENTS: dict[str, type[OfflineAlgorithm]] = {agent.algo_name: agent for agent in _CLASSES}
-# Trained, saved and loaded like agents, but means of measurement: not offered for a choice.
+# Trained, saved and loaded like agents, but measuring instruments: not offered for a choice.
 PROBES: dict[str, type[OfflineAlgorithm]] = {OfflineDCEProbe.algo_name: OfflineDCEProbe}
 
 

@@ -82,7 +82,7 @@ class AttachingMixin(OffPolicyAlgorithm):
         """
         Train on other data from the next ``learn()`` on.
 
-        :param dataset: catalogue id, path of an HDF5 file, or ``Transitions``
+        :param dataset: catalogue id, ``minari:`` id, path of a file, or ``Transitions``
         """
         self._remember_dataset(dataset)
         assert isinstance(self.replay_buffer, OfflineReplayBuffer)

@@ -14,16 +14,18 @@ import time
 import warnings
 from typing import Any, ClassVar, TypeVar
 
+import gymnasium as gym
 import numpy as np
 import torch as th
-from gymnasium import spaces
+from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dce.attaching import AttachingMixin, DatasetLike
 from sb3_dce.buffers import OfflineReplayBuffer
-from sb3_dce.checks import callback_frequencies, check_choice, check_number
+from sb3_dce.checks import callback_frequencies, check_choice, check_number, check_spaces
 from sb3_dce.envs import SpacesEnv
 from sb3_dce.errors import ConfigError, SB3DCEWarning
 from sb3_dce.execution import EXECUTIONS, Engine, Update, choose_execution, refuse_divergence
@@ -46,8 +48,9 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
     :param policy: ``"MlpPolicy"`` or a policy class
     :param env: environment for evaluation, an id, or ``None``: then a dataset gives the spaces. It is never stepped for
         training
-    :param dataset: catalogue id ("walker2d-medium"), path of an HDF5 file in D4RL layout, or a ``Transitions`` object.
-        Read at the first ``learn()``; only its id or path is saved with the model
+    :param dataset: catalogue id ("walker2d-medium"), ``minari:`` and an id of Minari, path of a file (HDF5 in D4RL's layout,
+        NPZ, CSV, Parquet), or ``Transitions``; :func:`sb3_dce.load_dataset` makes these of everything else. Read at the first
+        ``learn()``; only its id or path is saved with the model
     :param learning_rate: Adam's learning rate for all networks, or a schedule of the remaining progress
     :param batch_size: rows per gradient step, drawn uniformly with replacement
     :param tau: Polyak coefficient of the targets (the paper's upsilon)
@@ -59,7 +62,8 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
     :param reward_scale: factor on every reward
     :param reward_shift: added to every reward after scaling, reward units
     :param execution: ``"eager"``, ``"compile"`` (one compiled graph), ``"cudagraph"`` (that graph captured, on a CUDA
-        device), or ``"auto"``: the fast form when more than 10,000 updates are planned and a C++ compiler is there
+        device), or ``"auto"``: eager up to 10,000 planned updates, beyond that captured on a CUDA device and, where a C++
+        compiler is there, compiled on a CPU
     :param precision: of matrix products: ``"float32"``, ``"bf16-matmul"`` on processors that have it, ``"tf32"`` on a CUDA
         device. Parameters stay float32; the switch is put back after training
     :param stats_window_size: kept for Stable-Baselines3's logger
@@ -102,6 +106,10 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         spec = self._remember_dataset(dataset)
         if env is None and needs_env:
             env = self._spaces_env(spec, verbose)
+        if env is not None:
+            env = maybe_make_env(env, verbose)
+            if isinstance(env, (gym.Env, VecEnv)):  # Stable-Baselines3 says what else it takes
+                check_spaces(env.observation_space, env.action_space)
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]
@@ -120,7 +128,6 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
             device=device,
             seed=seed,
             sde_support=False,
-            supported_action_spaces=(spaces.Box,),
         )
         self.algo = self.algo_name  # tells whose file a saved model is
         self.normalize_obs = normalize_obs

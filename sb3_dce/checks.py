@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
 
 from sb3_dce.errors import ConfigError
@@ -62,6 +63,26 @@ def check_choice(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
     """
     if value not in allowed:
         raise ConfigError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}", key=name)
+
+
+def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+    """
+    :param observation_space: of an environment
+    :param action_space: of an environment
+    :raises ConfigError: if observations are no arrays of numbers, or actions have no finite bounds
+    """
+    if not isinstance(observation_space, spaces.Box):
+        raise ConfigError(
+            f"observations must be a Box, got {observation_space}",
+            key="env",
+            hint="Flatten them, for example with gymnasium.wrappers.FlattenObservation, in the data and the environment.",
+        )
+    if not isinstance(action_space, spaces.Box):
+        hint = "The agents of this package act continuously; there is none for discrete actions."
+        raise ConfigError(f"actions must be a Box, got {action_space}", key="env", hint=hint)
+    if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
+        hint = "Bound them with gymnasium.wrappers.RescaleAction or a space of your own: agents act within the bounds."
+        raise ConfigError(f"actions must have finite bounds, got {action_space}", key="env", hint=hint)
 
 
 def check_ends_with_evaluation(n_updates: int, eval_freq: int, whose: str = "") -> None:

@@ -123,7 +123,7 @@ def reproduce(
     ] = "",
     scale: Annotated[
         str,
-        typer.Option(help="[b]smoke[/b] (a minute), [b]cpu[/b] (a night on two cores), [b]full[/b] (the paper's protocol)."),
+        typer.Option(help="[b]smoke[/b] (a minute), [b]cpu[/b] (100,000 steps), [b]full[/b] (the paper's protocol)."),
     ] = "smoke",
     out: Annotated[
         Path | None, typer.Option(show_default=False, help="Folder of the results; default runs/reproduce-<scale>.")

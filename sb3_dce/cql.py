@@ -57,7 +57,7 @@ class OfflineCQL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
     :param actor_learning_rate: rate of actor and temperature; ``None`` takes ``learning_rate``
     :param ent_coef: temperature: a number, ``"auto"``, or ``"auto_0.1"`` to start at 0.1. A learned one is used after its
         step, as in the authors' code
-    :param target_entropy: wished entropy in nats when ``ent_coef`` is learned; ``"auto"`` is minus the action dimension
+    :param target_entropy: entropy aimed at, in nats, when ``ent_coef`` is learned; ``"auto"`` is minus the action dimension
     :param cql_weight: w, the weight of the regulariser; raising it makes Q more conservative. The authors use 5 or 10
         without a Lagrange multiplier
     :param n_actions: actions of each of the three kinds per state (authors: 10), 3 * n_actions + 1 critic rows per sample

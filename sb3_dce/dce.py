@@ -65,7 +65,7 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
 
     :param expectile: level of V in (0, 1), the paper's tau; raising it follows the better actions of the data more closely
     :param ent_coef: SAC temperature (the paper's alpha): a number, ``"auto"``, or ``"auto_0.1"`` to start at 0.1
-    :param target_entropy: wished entropy in nats when ``ent_coef`` is learned; ``"auto"`` is minus the action dimension
+    :param target_entropy: entropy aimed at, in nats, when ``ent_coef`` is learned; ``"auto"`` is minus the action dimension
     :param beta: penalty weight at the start, reward units; raising it makes Q more conservative
     :param beta_final: value the schedule never passes; ``None`` for a constant beta
     :param beta_rate: amount subtracted at each change of beta; negative makes beta rise

@@ -2,7 +2,7 @@
 The agent behind the paper's figure on out-of-distribution actions: SAC with V, and beside it critics trained with a penalty.
 
 One actor, the same batches and the same noise for all: the critics differ in beta alone. It has DCE's update, called once
-per set of critics, and is a means of measurement, not an agent to choose.
+per set of critics, and is a measuring instrument, not an agent to choose.
 """
 
 from __future__ import annotations

@@ -114,7 +114,7 @@ def descend_ent_coef(
 
     :param learner: the learner ``log_ent_coef`` before the step
     :param log_prob: log-probabilities of the policy's actions, shape (batch, 1), nats
-    :param target_entropy: wished entropy, 0-dimensional, nats
+    :param target_entropy: entropy aimed at, 0-dimensional, nats
     :param learning_rate: 0-dimensional
     :param settings: constants of the optimizer
     :return: learner after the step, loss

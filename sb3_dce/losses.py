@@ -139,7 +139,7 @@ def ent_coef_loss(log_ent_coef: th.Tensor, log_prob: th.Tensor, target_entropy: 
 
     :param log_ent_coef: shape (1,)
     :param log_prob: without gradient, shape (..., batch, 1), nats
-    :param target_entropy: wished entropy, nats; usually minus the number of action dimensions
+    :param target_entropy: entropy aimed at, nats; usually minus the number of action dimensions
     :return: shape (...)
     """
     return -batch_mean(log_ent_coef * (log_prob + target_entropy))

@@ -53,7 +53,7 @@ class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OODWeight, OfflineAlgor
     :param actor_learning_rate: rate of actor and temperature; ``None`` takes ``learning_rate``
     :param ent_coef: temperature: a number, ``"auto"``, or ``"auto_0.1"`` to start at 0.1. A learned one is used after its
         step, as in the authors' code
-    :param target_entropy: wished entropy in nats when ``ent_coef`` is learned; ``"auto"`` is minus the action dimension
+    :param target_entropy: entropy aimed at, in nats, when ``ent_coef`` is learned; ``"auto"`` is minus the action dimension
     :param n_critics: members of the ensemble, at least 2
     :param uncertainty_coef: eta, weight of u in the target; raising it makes Q more conservative
     :param n_ood_actions: actions of the policy per state, at s and at s' (authors: 10), 2 * n_ood_actions + 1 critic rows

@@ -33,7 +33,7 @@ class OfflineSAC(EntropyCoefficient, OfflineAlgorithm):
     Parameters not listed here are described in :class:`~sb3_dce.base.OfflineAlgorithm`.
 
     :param ent_coef: temperature: a number, ``"auto"``, or ``"auto_0.1"`` to start at 0.1
-    :param target_entropy: wished entropy in nats when ``ent_coef`` is learned; ``"auto"`` is minus the action dimension
+    :param target_entropy: entropy aimed at, in nats, when ``ent_coef`` is learned; ``"auto"`` is minus the action dimension
     :param max_grad_norm: clip each network's gradient to this norm; ``None`` is off
     """
 

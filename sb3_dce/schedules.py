@@ -38,7 +38,8 @@ class StepSchedule:
             raise ConfigError(
                 f"beta_rate={self.rate} moves beta={self.initial} away from beta_final={self.final}",
                 key="beta_rate",
-                hint="beta falls by beta_rate at each change: use a positive rate to fall and a negative one to rise.",
+                hint="For a constant beta set beta_final=None and beta_rate=0, too: a dataset's row may schedule it. "
+                "beta falls by beta_rate at each change, a negative rate lets it rise.",
             )
 
     def value(self, n_updates: int) -> float:

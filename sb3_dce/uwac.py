@@ -52,7 +52,7 @@ class OfflineUWAC(ActorLearningRate, OfflineAlgorithm):
     target and of the policy's own action. ``predict`` takes the best of 100 sampled actions, see
     :class:`~sb3_dce.uwac_policy.UWACPolicy`.
 
-    This agent is slow by its nature: 2560 next actions are valued 100 times by each critic at every update.
+    This agent is inherently slow: 2560 next actions are valued 100 times by each critic at every update.
 
     Differences from the authors' code: dropout masks of a pass are shared by the states of a batch (see
     :meth:`~sb3_dce.uwac_networks.DropoutCritic.mc_values`; a state's own means, variances and maxima are distributed as

@@ -786,10 +786,23 @@ def test_environment_with_other_spaces_is_refused(agent: Agent, transitions: Tra
         agent.cls.load(tmp_path / "model.zip", env=other)
 
 
-def test_discrete_actions_are_refused(agent: Agent, transitions: Transitions) -> None:
-    env = SpacesEnv(spaces.Box(-1.0, 1.0, (5,), np.float32), spaces.Discrete(2))
-    with pytest.raises((AssertionError, ValueError), match="Box"):
-        make(agent, env=env, dataset=transitions)
+VECTOR, UNBOUNDED = spaces.Box(-1.0, 1.0, (5,), np.float32), spaces.Box(-np.inf, np.inf, (2,), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("observations", "actions", "message"),
+    [
+        (VECTOR, spaces.Discrete(2), r"Discrete\(2\).*continuously"),
+        (VECTOR, UNBOUNDED, "finite bounds.*RescaleAction"),
+        (spaces.Dict(a=VECTOR), VECTOR, "observations must be a Box.*FlattenObservation"),
+        (spaces.Discrete(3), VECTOR, "observations must be a Box"),
+    ],
+)
+def test_spaces_that_no_agent_can_use_are_refused(
+    agent: Agent, observations: spaces.Space, actions: spaces.Space, message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        make(agent, env=SpacesEnv(observations, actions), dataset=None)
 
 
 def test_observation_statistics_of_vec_normalize_are_used(

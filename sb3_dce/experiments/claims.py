@@ -63,7 +63,11 @@ def own_table_facts() -> TextTable:
             "TD3-BC on halfcheetah-random",
             " and ".join(f"{c.score:g} ± {c.std:g}" for c in random_cells if c is not None) + ": equal to PBRL's cell",
         ),
-        ("M8", "Eq. 7, 9, 10, Algorithm 1", "see docs/dce.md: factor and sign of the gradient, exponents, Polyak coefficient"),
+        (
+            "M8",
+            "Eq. 7, 9, 10, Algorithm 1",
+            "slips of factor, sign and exponent; gamma for the Polyak coefficient (corrected in docs/dce.md)",
+        ),
         ("M9", "± of the totals", f"sum of the row deviations: DCE {dce.paper_std:.1f}; independent rows: {dce.std:.1f}"),
         ("M10", "caption of the Adroit table", 'says "in the Gym" and four episodes; the text says five'),
         ("M11", 'caption of Algorithm 1, "flexible conservative estimate"', "an older name; the expert sets were not run"),

@@ -138,7 +138,11 @@ def toy_table() -> TextTable:
         cells = (f"{k:g}", f"{beta:g}", f"{x:g}", f"{q_data:.2f}", f"{q_ood:.2f}", f"{gain:.2f}", f"{shift:.2f}")
         rows.append((*cells, "yes" if q_ood > q_data else "no", "yes" if gain > shift else "no"))
     header = ("k", "beta_eff", "x", "Q(1)", "Q(x)", "gain of Q*", "difference of the shifts", "x preferred", "claim says")
-    return TextTable(header, tuple(rows), "Closed solution of the linear critic, no training (dce.md, claim 4.3).")
+    return TextTable(
+        header,
+        tuple(rows),
+        "Linear critic, features (1, a), solved in closed form; data at a = -1 and 1 with values k a, policy at x.",
+    )
 
 
 def _toy_verdict(table: TextTable) -> Verdict:
@@ -193,7 +197,7 @@ def common_table() -> TextTable:
 def _config_verdict(table: TextTable) -> Verdict:
     agreeing = sum(row[-1] == "yes" for row in table.rows)
     rule = "alpha and the whole schedule of beta agree in all 23 rows"
-    return judge("E21: the configurations are the paper's", rule, agreeing == 23, f"{agreeing} of {len(table.rows)} rows")
+    return judge("The configurations are the paper's", rule, agreeing == 23, f"{agreeing} of {len(table.rows)} rows")
 
 
 def count(judged: list[Verdict]) -> str:

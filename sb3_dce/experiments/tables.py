@@ -257,7 +257,7 @@ def runtime_table(evidence: Evidence) -> TextTable:
         printed = "-" if cell is None or cell.score is None else f"{cell.score:g}"
         if len(rates):
             rows.append((variant.name, f"{np.median(rates):.1f}", f"{rates.min():.1f} to {rates.max():.1f}", printed))
-    note = "Wall time with evaluations, of runs side by side on a shared machine: an order, no benchmark."
+    note = "Wall time with evaluations, of runs beside others: an order; benchmarks/results/speed.md measures."
     header = ("agent", "s per 1000 updates (median)", "range", "paper: s per 1000, RTX 3070")
     return TextTable(header, tuple(rows), f"{evidence.caption(ids)} {note}")
 

@@ -476,12 +476,12 @@ def _adroit(evidence: Evidence) -> list[Verdict]:
     )
     holds = None if not pairs else all(a >= b for a, b in pairs.values()) and any(a > b for a, b in pairs.values())
     rule = "mean score with dropout 0.1 is higher, or both are equal, on every set of people's demonstrations that was run"
-    found = [judge("E26: dropout of the critics helps on human demonstrations", rule, holds, numbers)]
+    found = [judge("Dropout of the critics helps on human demonstrations", rule, holds, numbers)]
     sources = {source_of(name) for name in spreads}
     spreads = {name: value for name, value in spreads.items() if source_of(name) == min(sources)}  # "D4RL" before "sb3"
     wide = None if not spreads else max(spreads.values()) > 15.0
     rule = "largest standard deviation over seeds above 15 (paper: 37 on pen-human), of the sets with a constant alpha"
-    return [*found, judge("C9, E27: a constant alpha gives high variance over seeds", rule, wide, _text(spreads))]
+    return [*found, judge("C9: a constant alpha gives high variance over seeds", rule, wide, _text(spreads))]
 
 
 _TESTS: dict[str, tuple[Callable[[Evidence], list[Verdict]], ...]] = {
