@@ -65,6 +65,9 @@ class AttachingMixin(OffPolicyAlgorithm):
         :raises DatasetNotFoundError: if there is no file for the name
         :raises ConfigError: for an unknown hyperparameter
         """
+        if "dataset" in overrides:
+            hint = "Give it once, as the first argument; other data of a model: model.set_dataset(...)."
+            raise ConfigError(f"two datasets are given: {name!r} and {overrides['dataset']!r}", key="dataset", hint=hint)
         spec = None if isinstance(name, Transitions) else find_file(name)[1]
         row = hyperparams.load_row(cls.algo_name, None if spec is None else spec.id)
         arguments = {**hyperparams.split_row(row).kwargs, **overrides}

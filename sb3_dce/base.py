@@ -25,7 +25,16 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dce.attaching import AttachingMixin, DatasetLike
 from sb3_dce.buffers import OfflineReplayBuffer
-from sb3_dce.checks import callback_frequencies, check_choice, check_number, check_spaces
+from sb3_dce.checks import (
+    callback_frequencies,
+    check_choice,
+    check_flags,
+    check_number,
+    check_policy_kwargs,
+    check_seed_and_device,
+    check_spaces,
+    check_steps,
+)
 from sb3_dce.envs import SpacesEnv
 from sb3_dce.errors import ConfigError, SB3DCEWarning
 from sb3_dce.execution import EXECUTIONS, Engine, Update, choose_execution, refuse_divergence
@@ -102,6 +111,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         device: th.device | str,
         needs_env: bool,
     ) -> None:
+        check_seed_and_device(seed, device)
         self.d4rl_compat = d4rl_compat
         spec = self._remember_dataset(dataset)
         if env is None and needs_env:
@@ -233,6 +243,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         """
         :raises ConfigError: if a parameter is out of its range
         """
+        check_flags(self)
         check_number("batch_size", self.batch_size, 1, integer=True)
         check_number("gradient_steps", self.gradient_steps, 1, integer=True)
         check_number("tau", self.tau, 0, 1, hint="The paper's Polyak coefficient is 0.005; its tau is called expectile.")
@@ -259,8 +270,9 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
     def _setup_model(self) -> None:
         self.check_parameters()
         self._stats_window_size = self.stats_window_size
-        given = self.policy_kwargs
-        self.policy_kwargs = {**self.policy_settings(), **given}
+        given, settings = self.policy_kwargs, self.policy_settings()
+        check_policy_kwargs(given, self.policy_class, settings)
+        self.policy_kwargs = {**settings, **given}
         try:
             super()._setup_model()
         finally:
@@ -399,7 +411,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         """
         Train on the dataset.
 
-        :param total_timesteps: gradient steps; ``1e6`` is accepted
+        :param total_timesteps: gradient steps, a whole number; ``1e6`` is accepted
         :param callback: called after every gradient step
         :param log_interval: gradient steps between two log rows; ``None`` logs nothing by itself
         :param tb_log_name: name of the TensorBoard run, default the class name
@@ -410,7 +422,11 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         :raises DivergenceError: if a loss is not finite
         """
         total_timesteps, callback = self._setup_learn(
-            int(total_timesteps), callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
+            check_steps("total_timesteps", total_timesteps),
+            callback,
+            reset_num_timesteps,
+            tb_log_name or type(self).__name__,
+            progress_bar,
         )
         self._check_frequencies(callback, log_interval)
         callback.on_training_start(locals(), globals())
@@ -432,10 +448,6 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
-        if total_timesteps < 0:
-            raise ConfigError(
-                f"total_timesteps must be >= 0 gradient steps, got {total_timesteps}", key="total_timesteps", hint="Try 1e5."
-            )
         self.attach_dataset()
         if self.env is None:
             self.set_env(SpacesEnv(self.observation_space, self.action_space))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
 
@@ -63,6 +65,94 @@ def check_choice(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
     """
     if value not in allowed:
         raise ConfigError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}", key=name)
+
+
+def check_flags(owner: object) -> None:
+    """
+    :param owner: object with a constructor; each parameter that is declared ``bool`` must be one, since a text such as
+        "no" would count as true
+    :raises ConfigError: if one is not
+    """
+    for name, parameter in inspect.signature(type(owner)).parameters.items():
+        value = getattr(owner, name, None)
+        if parameter.annotation == "bool" and hasattr(owner, name) and not isinstance(value, (bool, np.bool_)):
+            raise ConfigError(f"{name} must be True or False, got {value!r}", key=name)
+
+
+def check_seed_and_device(seed: Any, device: Any) -> None:
+    """
+    :param seed: ``None`` or a whole number that NumPy and PyTorch take
+    :param device: as PyTorch names it, or "auto"
+    :raises ConfigError: if one of them is something else, or names a CUDA device where there is none
+    """
+    if seed is not None:
+        check_number("seed", seed, 0, 2**32 - 1, integer=True, hint="None draws one.")
+    if device == "auto":
+        return
+    try:
+        kind = th.device(device).type
+    except (RuntimeError, TypeError) as error:
+        hint = "For example 'auto', 'cpu', 'cuda' or 'cuda:1'."
+        raise ConfigError(f"device must be 'auto' or one of PyTorch's, got {device!r}", key="device", hint=hint) from error
+    if kind == "cuda" and not th.cuda.is_available():
+        raise ConfigError(f"device={device!r}, but PyTorch finds no CUDA device here", key="device", hint="Take 'auto'.")
+
+
+def check_steps(name: str, value: Any) -> int:
+    """
+    :param name: name of an argument that counts gradient steps
+    :param value: what the user gave; ``1e6`` is a whole number, too
+    :return: the number
+    :raises ConfigError: if it is none, negative or not whole
+    """
+    number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    if not number or not 0 <= value < float("inf") or value != int(value):
+        hint = "For example 1e5."
+        raise ConfigError(f"{name} must be a whole number of gradient steps from 0 up, got {value!r}", key=name, hint=hint)
+    return int(value)
+
+
+def check_widths(name: str, value: Any) -> None:
+    """
+    :param name: name of an argument with the widths of hidden layers
+    :param value: list of units per layer, or lists by network
+    :raises ConfigError: if it is something else
+    """
+    parts = value.values() if isinstance(value, dict) else [value]
+    for part in parts:
+        ok = isinstance(part, (list, tuple))
+        if not ok or any(isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1 for n in part):
+            hint = "For example [256, 256], or {'pi': [256], 'qf': [256, 256]}."
+            raise ConfigError(f"{name} must be a list of numbers of units, got {value!r}", key=name, hint=hint)
+
+
+def check_policy_kwargs(given: Any, policy_class: type, settings: dict[str, Any]) -> None:
+    """
+    :param given: the user's ``policy_kwargs``
+    :param policy_class: policy they are for
+    :param settings: arguments of the policy that the agent's own parameters decide
+    :raises ConfigError: for something that is no dictionary, an unknown name, or one that the agent decides
+    """
+    if not isinstance(given, dict):
+        hint = "For example {'net_arch': [256, 256]}."
+        raise ConfigError(f"policy_kwargs must be a dictionary, got {given!r}", key="policy_kwargs", hint=hint)
+    parameters = inspect.signature(policy_class).parameters
+    known = [name for name in parameters if name not in ("observation_space", "action_space", "lr_schedule", "use_sde")]
+    takes_all = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values())
+    for name, value in given.items():
+        if name not in parameters and not takes_all:
+            hint = f"It has {', '.join(known)}."
+            raise ConfigError(f"{policy_class.__name__} has no parameter {name!r}", where="policy_kwargs", key=name, hint=hint)
+        if name in settings and name not in ("net_arch", "features_extractor_class"):
+            hint = "It follows from the agent's own parameters: set it there, or leave it out."
+            raise ConfigError(f"{name}={value!r} in policy_kwargs would contradict the agent", key=name, hint=hint)
+        if name == "net_arch" and value is not None:
+            check_widths("net_arch", value)
+        if name == "activation_fn" and not isinstance(value, type):
+            hint = "For example torch.nn.Tanh."
+            raise ConfigError(f"activation_fn must be a class of torch.nn, got {value!r}", key="activation_fn", hint=hint)
+        if name == "n_critics":
+            check_number("n_critics", value, 1, integer=True)
 
 
 def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:

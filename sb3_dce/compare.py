@@ -26,7 +26,7 @@ from sb3_dce.files import write_atomically
 from sb3_dce.hyperparams import check_keys, full_name
 from sb3_dce.launch import launch_all
 from sb3_dce.plots import plot_learning_curves
-from sb3_dce.runs import RunSpec, read_divergence, read_result
+from sb3_dce.runs import RunSpec, check_before_running, read_divergence, read_result
 
 COLUMNS = ("agent", "seed", "n_updates", "mean_return", "normalized_score", "seconds", "seconds_per_1000", "overrides")
 
@@ -106,17 +106,16 @@ def compare(
         for seed in seeds  # all agents of a seed before the next seed: an interrupted comparison is a smaller one
         for algo in algos
     ]
-    # What diverges is a result, and would do the same again.
-    outcomes = launch_all([spec for spec in specs if read_divergence(Path(spec.folder)) is None], workers, console)
-    errors = [outcome for outcome in outcomes if isinstance(outcome, BaseException)]
-    if other := [error for error in errors if not isinstance(error, DivergenceError)]:
-        raise other[0]
-    for run in specs:
-        if (divergence := read_divergence(Path(run.folder))) is not None:
-            console.print(f"diverged: {run.name}, {divergence['reason']}", markup=False)
+    check_before_running(specs)
+    outcomes = launch_all(specs, workers, console)
     info = load_transitions(dataset).info
     level = float(info.episode_returns.mean()) if len(info.episode_returns) else None
-    return summarize(folder, algos, spec, level, console, lengths)
+    # What diverges is a result. Other errors are said below the table of what is complete.
+    errors = [o for o in outcomes if isinstance(o, BaseException) and not isinstance(o, DivergenceError)]
+    rows = summarize(folder, specs, spec, level, console) if len(errors) < len(specs) else []
+    if errors:
+        raise errors[0]
+    return rows
 
 
 def settings_of(algos: Sequence[str], overrides: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
@@ -159,30 +158,29 @@ def _one_of(algos: Sequence[str], name: str, key: str) -> str:
 
 
 def summarize(
-    folder: Path,
-    algos: Sequence[str],
-    spec: DatasetSpec | None,
-    data_return: float | None,
-    console: Console,
-    lengths: Mapping[str, int] | None = None,
+    folder: Path, specs: Sequence[RunSpec], spec: DatasetSpec | None, data_return: float | None, console: Console
 ) -> list[Row]:
     """
     Make table and picture from the result files of a comparison, complete or not.
 
     :param folder: of the comparison
-    :param algos: names of agents
+    :param specs: its runs
     :param spec: catalogue entry of the dataset, if there is one
     :param data_return: mean return of the data's episodes, if there are any
     :param console: where to print
-    :param lengths: only runs of so many gradient steps, by agent; ``None`` for all
     :return: one row per agent that has a complete run
+    :raises ConfigError: if no run is complete or has diverged
     """
     dataset_id = None if spec is None else spec.id
-    runs = {algo: {run: r for run in sorted((folder / algo).glob("seed_*")) if (r := read_result(run))} for algo in algos}
-    if lengths is not None:
-        runs = {algo: {f: r for f, r in found.items() if r["n_updates"] == lengths[algo]} for algo, found in runs.items()}
-    runs = {algo: found for algo, found in runs.items() if found}
-    if not runs:
+    runs: dict[str, dict[Path, dict[str, Any]]] = {}
+    lost: dict[str, str] = {}
+    for run in specs:
+        path = Path(run.folder)
+        if (divergence := read_divergence(path)) is not None:
+            lost[run.name] = str(divergence["reason"])
+        elif (result := read_result(path)) is not None and result["n_updates"] == run.n_updates:
+            runs.setdefault(run.algo, {})[path] = result
+    if not runs and not lost:
         raise ConfigError("no complete run", where=str(folder), hint="Run the comparison first; it goes on where it stopped.")
     results = {algo: list(found.values()) for algo, found in runs.items()}
     _write_csv(folder / "comparison.csv", results)
@@ -192,14 +190,19 @@ def summarize(
     if level is not None and dataset_id is not None:
         level = float(normalized_score(dataset_id, level))
     table = _cells(rows, level, scored)
+    notes = [f"Diverged, and in no mean: {name} ({reason})." for name, reason in lost.items()]
+    if rows and all(np.isnan(row.mean) for row in rows):
+        notes.append("Nothing was evaluated: no environment is known for these data, or its simulator is not installed.")
     _show(table, console)
+    for note in notes:
+        console.print(note, markup=False)
     curves = {algo: [read_evaluations(run, dataset_id) for run in found] for algo, found in runs.items()}
     # a run without evaluations has no part in the mean, which goes as far as the shortest
     curves = {algo: evaluated for algo, seeds in curves.items() if (evaluated := [seed for seed in seeds if seed])}
     levels = {} if level is None else {"mean of the data": level}
-    title = folder.name.removeprefix("compare-") if dataset_id is None else dataset_id
+    title = short_name(specs[0].dataset) if dataset_id is None else dataset_id
     picture = plot_learning_curves(curves, folder / "comparison.png", title, levels, confidence=True)
-    _write_markdown(folder / "comparison.md", title, table, picture)
+    _write_markdown(folder / "comparison.md", title, table, notes, picture)
     console.print(f"saved  {folder}/comparison.md, comparison.csv" + (f", {picture.name}" if picture else ""), markup=False)
     return rows
 
@@ -219,8 +222,8 @@ def _cells(rows: list[Row], data_level: float | None, scored: bool) -> list[list
     lines = [[*heading, "± over seeds", "seeds", "updates", "s per 1000 updates"]]
     for row in sorted(rows, key=lambda row: -row.mean):
         changed = ", ".join(f"{name}={value}" for name, value in row.overrides.items())
-        spread = "-" if np.isnan(row.std) else f"{row.std:.1f}"
-        numbers = [f"{row.mean:.1f}", spread, str(row.n_seeds), f"{row.n_updates:,}", f"{row.seconds_per_1000:.1f}"]
+        mean, spread = ("-" if np.isnan(value) else f"{value:.1f}" for value in (row.mean, row.std))
+        numbers = [mean, spread, str(row.n_seeds), f"{row.n_updates:,}", f"{row.seconds_per_1000:.1f}"]
         lines.append([row.agent, changed, *numbers])
     if data_level is not None:
         lines.append(["mean of the data", "", f"{data_level:.1f}", "", "", "", ""])
@@ -238,10 +241,10 @@ def _show(lines: list[list[str]], console: Console) -> None:
     console.print(table)
 
 
-def _write_markdown(path: Path, title: str, lines: list[list[str]], picture: Path | None) -> None:
+def _write_markdown(path: Path, title: str, lines: list[list[str]], notes: list[str], picture: Path | None) -> None:
     rule = ["---"] * len(lines[0])
     text = [f"# Agents on {title}", "", *(f"| {' | '.join(line)} |" for line in (lines[0], rule, *lines[1:])), ""]
-    text += ["Last evaluation of each run; the seconds are wall time, evaluations included.", ""]
+    text += [" ".join(["Last evaluation of each run; the seconds are wall time, evaluations included.", *notes]), ""]
     if picture is not None:
         text += [f"![Learning curves]({picture.name})", ""]
     with write_atomically(path) as stream:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar
 
 import numpy as np
@@ -28,7 +29,7 @@ def parse_ent_coef(ent_coef: str | float) -> tuple[bool, float]:
         value = float(text)
     except (TypeError, ValueError):
         value = float("nan")
-    if not value >= 0.0 or (learned and value == 0.0):
+    if not 0.0 <= value < math.inf or (learned and value == 0.0):
         raise ConfigError(
             f"ent_coef must be a number >= 0, 'auto' or 'auto_<start above 0>', got {ent_coef!r}",
             key="ent_coef",
@@ -54,13 +55,15 @@ class EntropyCoefficient:
         parse_ent_coef(self.ent_coef)
         if self.target_entropy != "auto":
             try:
-                float(self.target_entropy)
+                finite = math.isfinite(float(self.target_entropy))
             except (TypeError, ValueError):
+                finite = False
+            if not finite:
                 raise ConfigError(
                     f"target_entropy must be 'auto' or a number, got {self.target_entropy!r}",
                     key="target_entropy",
                     hint="'auto' is minus the number of action dimensions.",
-                ) from None
+                )
 
     def setup_extras(self) -> None:
         """Create the temperature and its optimizer."""

@@ -9,6 +9,7 @@ import sys
 import traceback
 from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,10 @@ def launch(specs: Sequence[RunSpec], workers: int, console: Console) -> list[dic
     :return: results in the order of ``specs``
     :raises SB3DCEError: the first error of a run; what the others have done is kept and resumed by the same call
     """
-    return [future.result() for future in _launch(specs, workers, console, keep_going=False)]
+    try:
+        return [future.result() for future in _launch(specs, workers, console, keep_going=False)]
+    except BrokenProcessPool as error:
+        raise _killed() from error
 
 
 def launch_all(specs: Sequence[RunSpec], workers: int, console: Console) -> list[dict[str, Any] | BaseException]:
@@ -53,7 +57,15 @@ def launch_all(specs: Sequence[RunSpec], workers: int, console: Console) -> list
     :return: results in the order of ``specs``, or the error of the run
     """
     futures = _launch(specs, workers, console, keep_going=True)
-    return [future.exception() or future.result() for future in futures]
+    outcomes = [future.exception() or future.result() for future in futures]
+    return [_killed() if isinstance(outcome, BrokenProcessPool) else outcome for outcome in outcomes]
+
+
+def _killed() -> RunFailedError:
+    return RunFailedError(
+        "a training process was ended from outside, as the system does when memory is short",
+        hint="Use fewer --workers; the same command goes on from the last checkpoints.",
+    )
 
 
 def _launch(specs: Sequence[RunSpec], workers: int, console: Console, keep_going: bool) -> list[Future[Any]]:
@@ -173,5 +185,5 @@ def train_one(spec: RunSpec, report: runs.Report) -> dict[str, Any]:
         raise RunFailedError(
             f"{spec.name} failed: {type(error).__name__}: {error}",
             where=str(folder),
-            hint="The whole report is in error.txt there; the same command resumes the run from its last checkpoint.",
+            hint="The whole report is in error.txt there. Without its cause the same command goes on.",
         ) from None

@@ -17,7 +17,6 @@ from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.checks import check_number, check_optional
 from sb3_dce.ensembles import EnsembleNet, EnsemblePolicy
 from sb3_dce.entropy import EntropyCoefficient, stepped_ent_coef
-from sb3_dce.errors import ConfigError
 from sb3_dce.execution import Update
 from sb3_dce.networks import OfflineCritic
 from sb3_dce.noise import NoiseSpec
@@ -173,12 +172,6 @@ class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OODWeight, OfflineAlgor
     def check_parameters(self) -> None:
         super().check_parameters()
         check_number("n_critics", self.n_critics, 2, integer=True, hint="One critic cannot disagree; the authors use 10.")
-        if "n_critics" in self.policy_kwargs:
-            raise ConfigError(
-                "n_critics is an argument of the agent, got it in policy_kwargs",
-                key="n_critics",
-                hint=f"Write {type(self).__name__}(..., n_critics=10).",
-            )
         for name in ("uncertainty_coef", "prior_scale"):
             check_number(name, getattr(self, name), 0)
         check_number("n_ood_actions", self.n_ood_actions, 1, integer=True)

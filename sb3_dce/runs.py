@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from importlib.metadata import version
@@ -26,11 +26,12 @@ from sb3_dce.agents import agent_class
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.data import find_file
 from sb3_dce.data.hashes import file_sha256
-from sb3_dce.errors import CheckpointError, ConfigError
+from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError
 from sb3_dce.evaluation import Evaluation, EvaluationCallback, catalogue_id, rollouts_of, write_evaluations
 from sb3_dce.files import write_atomically
 
 OTHER_FOLDER = "Choose another folder with --out, or delete this one."
+BEGIN_ANEW = "Delete the run's folder to run it anew."
 # Seconds between two progress reports.
 REPORT_INTERVAL = 0.5
 
@@ -104,10 +105,13 @@ def run(spec: RunSpec, report: Report = lambda progress: None) -> dict[str, Any]
     :param spec: what is to be run
     :param report: called with the progress
     :return: the result, also written as ``result.json``
+    :raises DivergenceError: if it diverges, or has diverged before, and would do the same again
     :raises SB3DCEError: if something is wrong with data, parameters or files
     """
     folder = Path(spec.folder)
     refuse_other_run(spec, folder)
+    if (divergence := read_divergence(folder)) is not None:
+        raise DivergenceError(divergence["reason"], where=str(folder), index=divergence["n_updates"], hint=BEGIN_ANEW)
     done = read_result(folder)
     if done is not None and done["n_updates"] == spec.n_updates:
         return done
@@ -173,7 +177,7 @@ def read_result(folder: Path) -> dict[str, Any] | None:
     :return: its result, ``None`` if it is not complete
     :raises CheckpointError: if the file is damaged
     """
-    return _read(folder / "result.json", json.loads)
+    return _read(folder / "result.json", json.loads, ("config", "n_updates", "seconds", "mean_return", "normalized_score"))
 
 
 def write_divergence(folder: Path, n_updates: int, reason: str) -> None:
@@ -193,7 +197,7 @@ def read_divergence(folder: Path) -> dict[str, Any] | None:
     :return: what :func:`write_divergence` wrote, ``None`` if the run has not diverged
     :raises CheckpointError: if the file is damaged
     """
-    return _read(folder / "diverged.json", json.loads)
+    return _read(folder / "diverged.json", json.loads, ("n_updates", "reason"))
 
 
 @lru_cache(maxsize=1)
@@ -227,20 +231,44 @@ def refuse_other_run(spec: RunSpec, folder: Path) -> None:
     begun, data = (part if isinstance(part, dict) else {} for part in (config.get("run"), config.get("dataset")))
     wanted = _plain(_config(spec))
     differing = [key for key in wanted if key not in ("n_updates", "dataset") and begun.get(key) != wanted[key]]
-    # The same data may be named otherwise: by an id, from another folder, after a move.
-    if data.get("sha256") != file_sha256(find_file(spec.dataset)[0]):
-        differing.append("dataset")
     done = read_result(folder)
     if done is not None and done["n_updates"] > spec.n_updates:
         differing.append("n_updates")
-    if differing:
-        changes = ", ".join(f"{key}={begun.get(key)!r} there, {wanted[key]!r} now" for key in differing)
+    changes = [f"{key}={begun.get(key)!r} there, {wanted[key]!r} now" for key in differing]
+    # The same data may be named otherwise: by an id, from another folder, after a move.
+    there, now = str(data.get("sha256")), file_sha256(find_file(spec.dataset)[0])
+    if there != now:
+        changes.append(f"dataset={begun.get('dataset')!r} (sha256 {there[:8]}) there, {spec.dataset!r} ({now[:8]}) now")
+    if changes:
         raise ConfigError(
-            f"the folder holds a run with other settings: {changes}",
+            f"the folder holds a run with other settings: {', '.join(changes)}",
             where=str(folder),
             path=folder,
             hint=OTHER_FOLDER,
         )
+
+
+def check_before_running(specs: Sequence[RunSpec]) -> None:
+    """
+    Find what is wrong with any of many runs before the first of them takes hours.
+
+    :param specs: what is to be run
+    :raises SB3DCEError: if a folder holds another run, or an agent cannot be made with its settings
+    """
+    made: list[tuple[str, str, dict[str, Any]]] = []
+    for spec in specs:
+        folder = Path(spec.folder)
+        refuse_other_run(spec, folder)
+        read_divergence(folder)
+        settings = (spec.algo, spec.dataset, spec.overrides)
+        if settings in made or read_result(folder) is not None or (folder / "checkpoint.zip").is_file():
+            continue
+        made.append(settings)
+        try:
+            agent_class(spec.algo).load_dataset(spec.dataset, seed=spec.seed, **{"device": "cpu", **spec.overrides})
+        except ConfigError as error:
+            where = f"{spec.algo}, {error.where}" if error.where else spec.algo
+            raise ConfigError(error.what, where=where, hint=error.hint, key=error.key) from error
 
 
 def read_config(folder: Path) -> dict[str, Any] | None:
@@ -252,16 +280,16 @@ def read_config(folder: Path) -> dict[str, Any] | None:
     return _read(folder / "config.yml", yaml.safe_load)
 
 
-def _read(path: Path, parse: Callable[[str], Any]) -> dict[str, Any] | None:
+def _read(path: Path, parse: Callable[[str], Any], keys: Sequence[str] = ()) -> dict[str, Any] | None:
     """A file of a run, None if there is none."""
     if not path.is_file():
         return None
     try:
         content = parse(path.read_text(encoding="utf-8"))
     except (ValueError, yaml.YAMLError, RecursionError, OSError) as error:
-        raise CheckpointError("the file is damaged", where=str(path), path=path, hint=OTHER_FOLDER) from error
-    if not isinstance(content, dict):
-        raise CheckpointError("the file is not that of a run", where=str(path), path=path, hint=OTHER_FOLDER)
+        raise CheckpointError("the file is damaged", where=str(path), path=path, hint=BEGIN_ANEW) from error
+    if not isinstance(content, dict) or not all(key in content for key in keys):
+        raise CheckpointError("the file is not that of a run", where=str(path), path=path, hint=BEGIN_ANEW)
     return content
 
 
@@ -269,7 +297,11 @@ def _model(spec: RunSpec, folder: Path) -> OfflineAlgorithm:
     agent, device = agent_class(spec.algo), spec.overrides.get("device", spec.device)
     for name in ("checkpoint.zip", "model.zip"):  # interrupted, or complete and now made longer
         if (folder / name).is_file():
-            model = agent.load(folder / name, device=device)
+            try:
+                model = agent.load(folder / name, device=device)
+            except CheckpointError as error:
+                hint = f"Delete it to go on without, or the whole folder: {folder}"
+                raise CheckpointError(error.what, where=str(folder / name), path=folder / name, hint=hint) from error
             model.set_dataset(spec.dataset)  # its file may have moved since
             return model
     model = agent.load_dataset(spec.dataset, seed=spec.seed, **{**spec.overrides, "device": device})

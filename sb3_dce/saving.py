@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import pathlib
+import pickle
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -18,6 +19,8 @@ from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 from sb3_dce import hyperparams
 from sb3_dce.errors import CheckpointError, DivergenceError
 from sb3_dce.files import write_atomically
+
+DAMAGED = "The file is damaged or something else: give a zip file written by model.save()."
 
 SelfSaving = TypeVar("SelfSaving", bound="SavingMixin")
 
@@ -102,17 +105,25 @@ class SavingMixin(OffPolicyAlgorithm):
             (changed) configuration
         """
         hyperparams.check_keys(cls, kwargs, where=f"{cls.__name__}.load")
-        if not isinstance(path, io.IOBase):
-            path = existing_zip(Path(path))
-            saved = saved_algo(path)
-            if saved != cls.algo_name:
-                raise CheckpointError(
-                    f"the file holds a model of {saved or 'another package'!r}, not of {cls.algo_name!r} ({cls.__name__})",
-                    where=str(path),
-                    path=path,
-                    hint="Load it with the class it was saved from.",
-                )
-        return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        source = path if isinstance(path, io.IOBase) else existing_zip(Path(path))
+        cls._refuse_other_agents(source)
+        try:
+            return super().load(source, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+        except (zipfile.BadZipFile, pickle.UnpicklingError, EOFError, RuntimeError) as error:
+            raise CheckpointError(
+                f"the model cannot be read: {str(error).splitlines()[0][:200]}", where=_name_of(source), hint=DAMAGED
+            ) from error
+
+    @classmethod
+    def _refuse_other_agents(cls, source: Path | io.IOBase) -> None:
+        saved = saved_algo(source)
+        if saved != cls.algo_name:
+            raise CheckpointError(
+                f"the file holds a model of {saved or 'another package'!r}, not of {cls.algo_name!r} ({cls.__name__})",
+                where=_name_of(source),
+                path=None if isinstance(source, io.IOBase) else source,
+                hint="Load it with the class it was saved from.",
+            )
 
     def set_parameters(
         self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
@@ -123,8 +134,11 @@ class SavingMixin(OffPolicyAlgorithm):
         :param load_path_or_dict: zip file, or dictionary as from ``get_parameters()``
         :param exact_match: demand all parameters
         :param device: device
-        :raises CheckpointError: if the parameters belong to another configuration
+        :raises CheckpointError: if the parameters belong to another agent or configuration
         """
+        if not isinstance(load_path_or_dict, dict):
+            source = load_path_or_dict if isinstance(load_path_or_dict, io.IOBase) else existing_zip(Path(load_path_or_dict))
+            self._refuse_other_agents(source)
         if isinstance(load_path_or_dict, dict) and exact_match:
             expected, got = set(self._get_torch_save_params()[0]), set(load_path_or_dict)
             if expected != got:
@@ -163,25 +177,28 @@ def existing_zip(path: Path) -> Path:
     raise CheckpointError("no such file", where=str(path), path=path, hint="Give the path of a saved model, a .zip file.")
 
 
-def saved_algo(path: Path) -> str | None:
+def saved_algo(path: Path | io.IOBase) -> str | None:
     """
     Which agent a file belongs to; nothing in it is unpickled.
 
-    :param path: zip file
+    :param path: zip file, or one opened for reading, whose position is kept
     :return: name of the agent, ``None`` for a model of another package
     :raises CheckpointError: if it is no saved model
     """
+    position = path.tell() if isinstance(path, io.IOBase) else 0
     try:
         with zipfile.ZipFile(path) as archive:
             saved = json.loads(archive.read("data"))
     except (zipfile.BadZipFile, KeyError, ValueError, OSError) as error:
-        raise CheckpointError(
-            f"not a saved model ({error})",
-            where=str(path),
-            path=path,
-            hint="The file is damaged or something else: give a zip file written by model.save().",
-        ) from error
+        found = None if isinstance(path, io.IOBase) else path
+        raise CheckpointError(f"not a saved model ({error})", where=_name_of(path), path=found, hint=DAMAGED) from error
+    if isinstance(path, io.IOBase):
+        path.seek(position)
     return saved.get("algo") if isinstance(saved, dict) else None
+
+
+def _name_of(source: Path | io.IOBase) -> str:
+    return str(getattr(source, "name", "stream")) if isinstance(source, io.IOBase) else str(source)
 
 
 def _cloned(tree: Any) -> Any:

@@ -14,7 +14,7 @@ from sb3_dce import losses
 from sb3_dce.actor_rate import ActorLearningRate
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
-from sb3_dce.checks import check_choice, check_number, check_optional
+from sb3_dce.checks import check_choice, check_number, check_optional, check_widths
 from sb3_dce.execution import Update
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.state import PureNet, Storage
@@ -188,8 +188,8 @@ class OfflineUWAC(ActorLearningRate, OfflineAlgorithm):
             check_number(name, getattr(self, name), 1, integer=True)
         check_number("policy_eval_start", self.policy_eval_start, 0, integer=True)
         check_choice("actor_q_timing", self.actor_q_timing, ("previous", "updated"))
-        for width in self.vae_net_arch or []:
-            check_number("vae_net_arch", width, 1, integer=True, hint="Give the widths of the hidden layers.")
+        if self.vae_net_arch is not None:
+            check_widths("vae_net_arch", self.vae_net_arch)
         check_optional("max_grad_norm", self.max_grad_norm)
 
     def policy_settings(self) -> dict[str, Any]:

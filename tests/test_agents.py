@@ -992,6 +992,18 @@ WRONG: list[tuple[str, Any]] = [
     ("steps_per_epoch", 0),
     ("pseudo_target_floor", float("nan")),
     ("prior_scale", -1.0),
+    ("normalize_obs", "None"),
+    ("d4rl_compat", "no"),
+    ("max_q_backup", 1),
+    ("adaptive_ood_weight", "yes"),
+    ("ent_coef", float("inf")),
+    ("target_entropy", float("nan")),
+    ("vae_net_arch", 5),
+    ("seed", -1),
+    ("seed", 1.5),
+    ("seed", 2**33),
+    ("device", "cudaa"),
+    ("device", None),
 ]
 
 
@@ -1007,6 +1019,48 @@ WRONG: list[tuple[str, Any]] = [
 def test_wrong_argument_is_refused_by_the_constructor(key: str, name: str, value: Any, spaces_env: SpacesEnv) -> None:
     with pytest.raises(ConfigError, match=name):
         make(AGENTS[key], env=spaces_env, **{name: value})
+
+
+@pytest.mark.parametrize(
+    ("policy_kwargs", "message"),
+    [
+        (5, "policy_kwargs must be a dictionary"),
+        ({"nonsense": 1}, "no parameter 'nonsense'. It has net_arch"),
+        ({"net_arch": 8}, "net_arch must be a list"),
+        ({"net_arch": [-3]}, "net_arch must be a list"),
+        ({"net_arch": {"pi": [8.0]}}, "net_arch must be a list"),
+        ({"activation_fn": "tanh"}, "activation_fn must be a class"),
+        ({"n_critics": 0}, "n_critics must be an integer"),
+    ],
+)
+def test_wrong_policy_arguments_are_refused(policy_kwargs: Any, message: str, spaces_env: SpacesEnv) -> None:
+    with pytest.raises(ConfigError, match=message):
+        AGENTS["DCE"].cls("MlpPolicy", spaces_env, policy_kwargs=policy_kwargs)
+
+
+@pytest.mark.parametrize(
+    ("key", "policy_kwargs"),
+    [
+        ("UWAC", {"critic_dropout": 0.5}),
+        ("UWAC", {"n_mc_dropout": 5}),
+        ("PBRL", {"n_critics": 3}),
+        ("PBRL", {"random_prior": True}),
+        ("IQL", {"use_v": False}),
+        ("DCE", {"critic_weight_decay": -1.0}),
+    ],
+)
+def test_policy_arguments_that_the_agent_decides_are_refused(
+    key: str, policy_kwargs: dict[str, Any], spaces_env: SpacesEnv
+) -> None:
+    with pytest.raises(ConfigError, match="would contradict the agent"):
+        make(AGENTS[key], env=spaces_env, policy_kwargs=policy_kwargs)
+
+
+@pytest.mark.parametrize("steps", [float("nan"), float("inf"), "abc", None, 0.5, 2.7, -1, True])
+def test_number_of_steps_that_is_none_is_refused(steps: Any, transitions: Transitions) -> None:
+    model = make(AGENTS["BC"], dataset=transitions)
+    with pytest.raises(ConfigError, match="total_timesteps must be a whole number"):
+        model.learn(steps)
 
 
 # -- DCE only ----------------------------------------------------------------------------------------------------------

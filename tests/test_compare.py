@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,22 @@ import yaml
 from rich.console import Console
 
 from sb3_dce.compare import compare, settings_of, summarize
-from sb3_dce.data import resolve
+from sb3_dce.data import Transitions, resolve
 from sb3_dce.data.catalog import normalized_score
-from sb3_dce.errors import ConfigError
+from sb3_dce.errors import CheckpointError, ConfigError
 from sb3_dce.evaluation import Evaluation, write_evaluations
 from sb3_dce.plots import _interval
+from sb3_dce.runs import RunSpec
 
 TINY = "halfcheetah-tiny-sb3"
+
+
+def specs_of(folder: Path, seeds: dict[str, int], n_updates: int) -> list[RunSpec]:
+    return [
+        RunSpec(algo, TINY, seed, n_updates, str(folder / algo / f"seed_{seed}"))
+        for algo in seeds
+        for seed in range(seeds[algo])
+    ]
 
 
 def test_comparison_trains_writes_and_goes_on(tmp_path: Path) -> None:
@@ -58,8 +68,44 @@ def test_agent_that_diverges_does_not_end_the_comparison(tmp_path: Path, capsys:
     for _ in range(2):  # the second call does not try again
         rows = compare(*arguments, Console(width=140), overrides=settings)
         assert [row.agent for row in rows] == ["offline_bc"]
-        assert "diverged: sac_v seed 0, training diverged" in capsys.readouterr().out
-    assert (tmp_path / "comparison.md").is_file()
+        assert "Diverged, and in no mean: sac_v seed 0 (training diverged" in capsys.readouterr().out
+    assert "Diverged, and in no mean: sac_v seed 0" in (tmp_path / "comparison.md").read_text()
+    with pytest.raises(ConfigError, match="a run with other settings: overrides"):  # it would not be tried with these
+        compare(*arguments, Console(quiet=True))
+
+
+def test_what_is_wrong_with_any_agent_is_said_before_the_first_is_trained(tmp_path: Path) -> None:
+    quiet = Console(quiet=True)
+    with pytest.raises(ConfigError, match="offline_td3bc: alpha must be"):
+        compare(TINY, ["bc", "td3bc"], 2, range(1), 2, 1, 1, tmp_path, quiet, overrides={"td3bc.alpha": -1})
+    assert not any(tmp_path.iterdir())
+    compare(TINY, ["bc"], 2, range(2), 2, 1, 1, tmp_path, quiet)
+    with pytest.raises(ConfigError, match="other settings: overrides"):
+        compare(TINY, ["iql", "bc"], 2, range(1), 2, 1, 1, tmp_path, quiet, overrides={"batch_size": 8})
+    assert not (tmp_path / "offline_iql").exists()
+    shutil.rmtree(tmp_path / "offline_bc" / "seed_0")
+    (row,) = compare(TINY, ["bc"], 2, range(1), 2, 1, 1, tmp_path, quiet, overrides={"batch_size": 8})
+    assert row.n_seeds == 1 and row.overrides == {"batch_size": 8}, "seed 1 is a run of other settings"
+
+
+def test_result_file_without_its_contents_is_said(tmp_path: Path) -> None:
+    compare(TINY, ["bc"], 2, range(1), 2, 1, 1, tmp_path, Console(quiet=True))
+    for name in ("result.json", "diverged.json"):
+        (tmp_path / "offline_bc" / "seed_0" / name).write_text("{}")
+        with pytest.raises(CheckpointError, match=f"{name}: the file is not that of a run.*Delete the run's folder"):
+            compare(TINY, ["bc"], 2, range(1), 2, 1, 1, tmp_path, Console(quiet=True))
+        (tmp_path / "offline_bc" / "seed_0" / "result.json").unlink(missing_ok=True)
+
+
+def test_data_without_an_environment_have_seconds_and_no_scores(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    n = 40
+    arrays = {"observations": np.zeros((n, 3), np.float32), "actions": np.zeros((n, 2), np.float32)}
+    flags = {"terminals": np.zeros(n, bool), "timeouts": np.arange(n) % 10 == 9}
+    Transitions.from_arrays(**arrays, rewards=np.arange(n, dtype=np.float32), **flags).to_npz(tmp_path / "logs.npz")
+    (row,) = compare(str(tmp_path / "logs.npz"), ["bc"], 2, range(1), 2, 1, 1, tmp_path / "out", Console(width=140))
+    assert np.isnan(row.mean) and "Nothing was evaluated" in capsys.readouterr().out
+    text = (tmp_path / "out" / "comparison.md").read_text()
+    assert "# Agents on logs" in text and "nan" not in text
 
 
 def test_runs_of_another_length_are_not_in_the_table(tmp_path: Path) -> None:
@@ -99,7 +145,8 @@ def test_table_is_made_from_the_complete_runs(tmp_path: Path, capsys: pytest.Cap
             (folder / "result.json").write_text(json.dumps({**result, "normalized_score": score}))
     (tmp_path / "dce" / "seed_3").mkdir()  # begun, not complete
     write_evaluations(tmp_path / "dce" / "seed_3", [Evaluation(10, (1.0, 2.0), (5, 5), None)])
-    rows = summarize(tmp_path, ["offline_bc", "dce", "offline_iql"], resolve(TINY), 4651.0, Console(width=120))
+    specs = specs_of(tmp_path, {"offline_bc": 1, "dce": 4, "offline_iql": 1}, 2000)
+    rows = summarize(tmp_path, specs, resolve(TINY), 4651.0, Console(width=120))
     assert [(row.agent, row.n_seeds, row.mean) for row in rows] == [("offline_bc", 1, 40.0), ("dce", 3, 45.0)]
     assert rows[1].std == pytest.approx(np.std(scores["dce"], ddof=1)) and np.isnan(rows[0].std)
     assert rows[0].seconds_per_1000 == 5.0
@@ -120,7 +167,7 @@ def test_runs_without_an_evaluation_are_left_out_of_the_curves(tmp_path: Path, m
     for seed in range(2):
         evaluations = [Evaluation(n, (1.0, 2.0), (5, 5), None) for n in (10, 20)]
         write_evaluations(tmp_path / "dce" / f"seed_{seed}", evaluations)
-    summarize(tmp_path, ["dce", "offline_bc"], resolve(TINY), None, Console(quiet=True))
+    summarize(tmp_path, specs_of(tmp_path, {"dce": 3, "offline_bc": 1}, 20), resolve(TINY), None, Console(quiet=True))
     assert list(drawn) == ["dce"] and [len(seed) for seed in drawn["dce"]] == [2, 2]
 
 
@@ -133,7 +180,7 @@ def test_agents_that_do_not_exist_or_come_twice_are_refused(tmp_path: Path) -> N
         with pytest.raises(ConfigError, match=message):
             compare(TINY, algos, 4, range(1), 2, 1, 1, tmp_path, Console(quiet=True))
     with pytest.raises(ConfigError, match="no complete run"):
-        summarize(tmp_path, ["dce"], resolve(TINY), None, Console(quiet=True))
+        summarize(tmp_path, specs_of(tmp_path, {"dce": 1}, 4), resolve(TINY), None, Console(quiet=True))
 
 
 @pytest.mark.parametrize(("n", "quantile"), [(3, 4.3027), (5, 2.7764), (12, 2.2010), (31, 2.0423), (1000, 1.9623)])

@@ -50,7 +50,7 @@ def rollouts() -> Rollouts:
 
 def agents() -> list[Any]:
     env = make_env_if_possible(HOPPER)
-    uwac = OfflineUWAC("MlpPolicy", env, seed=2, policy_kwargs={**SMALL, "n_mc_dropout": 3, "n_predict_actions": 5})
+    uwac = OfflineUWAC("MlpPolicy", env, seed=2, n_mc_dropout=3, n_predict_actions=5, policy_kwargs=SMALL)
     return [OfflineDCE("MlpPolicy", env, seed=0, policy_kwargs=SMALL), SAC("MlpPolicy", env, seed=1), uwac]
 
 
