@@ -27,6 +27,14 @@ app.add_typer(cli_datasets.app, name="datasets")
 
 console = Console(highlight=False)
 
+LAST_SEED = 2**32 - 1  # of NumPy's generators
+# Arguments of the agents that these commands set themselves.
+NOT_FOR_SET = {
+    "dataset": "The dataset is named before: train DATASET, compare --dataset DATASET.",
+    "env": "The environment is that of the dataset.",
+    "seed": "Say how many with --seeds.",
+}
+
 
 @app.command()
 def demo(
@@ -48,7 +56,7 @@ def train(
         float, typer.Option(min=0, show_default=False, help="Gradient steps, e.g. 1e6; default: the dataset's row.")
     ] = 0,
     seeds: Annotated[int, typer.Option(min=1, help="Number of seeds, each a run of its own.")] = 1,
-    first_seed: Annotated[int, typer.Option(min=0, help="The first of them.")] = 0,
+    first_seed: Annotated[int, typer.Option(min=0, max=LAST_SEED, help="The first of them.")] = 0,
     eval_freq: Annotated[int, typer.Option(min=1, help="Gradient steps between two evaluations and checkpoints.")] = 5000,
     eval_episodes: Annotated[int, typer.Option(min=1, help="Episodes of each evaluation.")] = 10,
     workers: Annotated[int, typer.Option(min=0, show_default=False, help="Processes; default: one per core.")] = 0,
@@ -131,11 +139,17 @@ def reproduce(
     datasets: Annotated[
         str, typer.Option(help="Only these, separated by commas, or [b]present[/b] for those that are on this machine.")
     ] = "",
-    agents: Annotated[str, typer.Option(help="Only these, separated by commas: headings of the table or names.")] = "",
-    seeds: Annotated[int, typer.Option(min=0, show_default=False, help="Number of seeds instead of the scale's.")] = 0,
-    first_seed: Annotated[int, typer.Option(min=0, help="The first of them.")] = 0,
-    updates: Annotated[float, typer.Option(min=0, show_default=False, help="Gradient steps instead of the scale's.")] = 0,
-    eval_freq: Annotated[int, typer.Option(min=0, show_default=False, help="Steps between two evaluations.")] = 0,
+    agents: Annotated[
+        str, typer.Option(help="Only these, headings of the table or names, separated by commas, or by semicolons.")
+    ] = "",
+    seeds: Annotated[
+        int | None, typer.Option(min=1, show_default=False, help="Number of seeds instead of the scale's.")
+    ] = None,
+    first_seed: Annotated[int, typer.Option(min=0, max=LAST_SEED, help="The first of them.")] = 0,
+    updates: Annotated[
+        float | None, typer.Option(min=1, show_default=False, help="Gradient steps instead of the scale's.")
+    ] = None,
+    eval_freq: Annotated[int | None, typer.Option(min=1, show_default=False, help="Steps between two evaluations.")] = None,
     workers: Annotated[int, typer.Option(min=0, show_default=False, help="Processes; default: one per core.")] = 0,
     device: Annotated[
         str, typer.Option(help="[b]cpu[/b], [b]cuda[/b] (many runs in one computation) or [b]auto[/b].")
@@ -170,11 +184,11 @@ def reproduce(
         scale=scale,
         out=out or Path("runs") / f"reproduce-{scale}",
         datasets=_names(datasets),
-        agents=_names(agents),
-        seeds=seeds or None,
+        agents=_names(agents, ";" if ";" in agents else ","),
+        seeds=seeds,
         first_seed=first_seed,
-        updates=_steps(updates) or None,
-        eval_freq=eval_freq or None,
+        updates=None if updates is None else _steps(updates),
+        eval_freq=eval_freq,
         workers=workers or os.cpu_count() or 1,
         device=device,
         ray_address=ray_address,
@@ -204,8 +218,8 @@ def evaluate(
     console.print(f"return {outcome.mean:.1f} ± {outcome.std:.1f} over {len(outcome.returns)} episodes{score}")
 
 
-def _names(text: str) -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.split(",") if name.strip())
+def _names(text: str, sign: str = ",") -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(sign) if name.strip())
 
 
 def _parse_overrides(pairs: list[str]) -> dict[str, Any]:
@@ -224,6 +238,10 @@ def _parse_overrides(pairs: list[str]) -> dict[str, Any]:
                 value = float(value)
             except ValueError:
                 pass
+        if isinstance(value, str) and value.lower() == "none":
+            value = None
+        if (other := NOT_FOR_SET.get(key.strip().rpartition(".")[2])) is not None:
+            raise ConfigError(f"--set {pair} sets no hyperparameter", key="--set", hint=other)
         overrides[key.strip()] = value
     return overrides
 

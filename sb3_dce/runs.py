@@ -31,7 +31,7 @@ from sb3_dce.evaluation import Evaluation, EvaluationCallback, catalogue_id, rol
 from sb3_dce.files import write_atomically
 
 OTHER_FOLDER = "Choose another folder with --out, or delete this one."
-BEGIN_ANEW = "Delete the run's folder to run it anew."
+BEGIN_ANEW = "Delete the run's folder to run it anew, or choose another one with --out."
 # Seconds between two progress reports.
 REPORT_INTERVAL = 0.5
 

@@ -786,6 +786,32 @@ def test_environment_with_other_spaces_is_refused(agent: Agent, transitions: Tra
         agent.cls.load(tmp_path / "model.zip", env=other)
 
 
+@pytest.mark.parametrize(("key", "other"), [("SAC", "CQL"), ("DCE", "SAC-V"), ("BC", "IQL")])
+def test_file_object_with_another_agent_is_refused(key: str, other: str, transitions: Transitions, tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    model = make(AGENTS[key], dataset=transitions)
+    model.save(stream)
+    stream.seek(0)
+    with pytest.raises(CheckpointError, match=f"a model of '{model.algo_name}'"):
+        AGENTS[other].cls.load(stream)
+    assert type(AGENTS[key].cls.load(stream)) is AGENTS[key].cls, "the stream stands where it stood"
+    model.save(tmp_path / "model.zip")
+    with pytest.raises(CheckpointError, match=f"a model of '{model.algo_name}'"):
+        make(AGENTS[other], dataset=transitions).set_parameters(str(tmp_path / "model.zip"))
+    with pytest.raises(CheckpointError, match="not a saved model"):
+        AGENTS[key].cls.load(io.BytesIO(b"garbage"))
+
+
+def test_model_whose_networks_are_cut_is_one_clear_message(transitions: Transitions, tmp_path: Path) -> None:
+    make(AGENTS["BC"], dataset=transitions).save(tmp_path / "model.zip")
+    with zipfile.ZipFile(tmp_path / "model.zip") as whole, zipfile.ZipFile(tmp_path / "cut.zip", "w") as cut:
+        for name in whole.namelist():
+            content = whole.read(name)
+            cut.writestr(name, content[: len(content) // 2] if name == "policy.pth" else content)
+    with pytest.raises(CheckpointError, match=r"cut\.zip: the model cannot be read"):
+        AGENTS["BC"].cls.load(tmp_path / "cut.zip")
+
+
 VECTOR, UNBOUNDED = spaces.Box(-1.0, 1.0, (5,), np.float32), spaces.Box(-np.inf, np.inf, (2,), np.float32)
 
 

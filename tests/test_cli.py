@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -164,6 +165,8 @@ def test_an_interrupted_run_goes_on_and_ends_like_an_uninterrupted_one(tmp_path:
         (("train", "missing.hdf5"), ("no such file", "missing.hdf5")),
         (("train", TINY, "--set", "betta=2"), ("'betta'", "Did you mean 'beta'")),
         (("train", TINY, "--set", "beta"), ("KEY=VALUE",)),
+        (("train", TINY, "--set", "dataset=hopper-medium"), ("no hyperparameter", "train DATASET")),
+        (("compare", "--dataset", TINY, "--set", "bc.seed=5"), ("no hyperparameter", "--seeds")),
         (("train", TINY, "--set", "expectile=1.7"), ("expectile must be", "1.7", "0.7")),
         (("train", TINY, "--set", "n_timesteps=5"), ("no parameter 'n_timesteps'",)),
         (("train", TINY, "--updates", "inf"), ("whole number", "inf")),
@@ -173,6 +176,10 @@ def test_an_interrupted_run_goes_on_and_ends_like_an_uninterrupted_one(tmp_path:
         (("compare", "--dataset", TINY, "--updates-of", "pbrl"), ("AGENT=UPDATES", "pbrl=1e4")),
         (("compare", "--dataset", TINY, "--updates-of", "pbrl=1.5"), ("whole number", "pbrl=1.5")),
         (("reproduce", ","), ("no experiment is named", "--list")),
+        (("reproduce", "all,table1"), ("all stands alone",)),
+        (("reproduce", "table1", "--report-only", "--agents", "BC"), ("trains nothing", "leave out")),
+        (("reproduce", "table1", "--reuse", "."), ("no result rows in the folder", "--import")),
+        (("reproduce", "table1", "--import", "."), ("no runs below the folder",)),
         (("evaluate", "missing.zip"), ("no such file",)),
         (("datasets", "info", "nonsense"), ("nonsense",)),
     ],
@@ -185,6 +192,32 @@ def test_user_errors_are_one_clear_message(
     assert list(tmp_path.iterdir()) == []
     for word in words:
         assert word in message
+
+
+def children_of(pid: int) -> list[int]:
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parent, command = int(stat.read_text().rpartition(")")[2].split()[1]), (stat.parent / "cmdline").read_bytes()
+        except (OSError, IndexError):
+            continue
+        if parent == pid and b"spawn_main" in command:
+            found.append(int(stat.parent.name))
+    return found
+
+
+def test_training_process_that_is_killed_is_one_clear_message(tmp_path: Path) -> None:
+    command = ["compare", "--dataset", TINY, "--algos", "bc", "--seeds", "1", "--updates", "1e6", "--eval-freq", "1000000"]
+    arguments = [sys.executable, "-c", "from sb3_dce.cli import main; main()", *command, *FAST, "--out", str(tmp_path)]
+    process = subprocess.Popen(arguments, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    deadline = time.monotonic() + 120
+    while not list(tmp_path.rglob("progress_0.csv")) and time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.1)
+    for pid in children_of(process.pid):
+        os.kill(pid, signal.SIGKILL)
+    _, message = process.communicate(timeout=60)
+    assert process.returncode == 2 and "Traceback" not in message
+    assert "ended from outside" in message and "fewer --workers" in message
 
 
 @pytest.mark.parametrize("command", [("reproduce", "config-tables"), ("compare", "--dataset", TINY, "--updates", "4")])
@@ -239,7 +272,8 @@ def test_help_reads_well(command: list[str]) -> None:
 
 def test_overrides_are_read_as_yaml_without_evaluation() -> None:
     pairs = ["beta=2.0", "learning_rate=3e-4", "use_v=false", "policy_kwargs={net_arch: [8, 8]}", "ent_coef=auto"]
-    assert cli._parse_overrides(pairs) == {
+    assert cli._parse_overrides([*pairs, "beta_final=None"]) == {
+        "beta_final": None,
         "beta": 2.0,
         "learning_rate": 3e-4,
         "use_v": False,

@@ -281,6 +281,20 @@ def test_gap_to_the_reference_is_zero_on_rows_made_by_the_theory() -> None:
     assert all(np.abs(curve.to_numpy()).max() < 1e-3 for curve, _ in curves.values())
 
 
+def test_file_that_is_here_counts_where_rows_of_two_are_known() -> None:
+    other = "cd" * 32
+    rows = results.merge(
+        [
+            table_rows(TABLE, {CHEETAH: {"IQL": [40.0, 41.0], "BC": [30.0]}}),
+            table_rows(TABLE, {CHEETAH: {"IQL": [20.0]}}, sha=other),
+        ]
+    )
+    for here, score in ((None, 40.5), ("ef" * 32, 40.5), (SHA, 40.5), (other, 20.0)):
+        evidence = Evidence(TABLE, rows, TABLE.scales["cpu"], None, lambda _, here=here: here)  # type: ignore[misc]
+        assert evidence.last(TABLE.variant("IQL"), CHEETAH).mean() == score
+        assert evidence.left_out == (3 if here == other else 1)
+
+
 def test_reproduction_counts_rows_of_d4rl_at_the_papers_length_only() -> None:
     table = {"walker2d-medium-v2": {"DCE": [84.0, 85.0]}, "hopper-medium-v2": {"DCE": [10.0, 11.0]}}
     own = {"walker2d-random-sb3": {"DCE": [0.0, 0.0]}}

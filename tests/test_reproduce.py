@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import h5py
 import numpy as np
 import pandas as pd
 import pytest
@@ -22,8 +24,8 @@ from rich.console import Console
 from update_tools import all_tensors, largest_difference
 
 from sb3_dce import OfflineDCE
-from sb3_dce.data import write_hdf5
-from sb3_dce.data.locate import DATASETS_VARIABLE
+from sb3_dce.data import resolve, write_hdf5
+from sb3_dce.data.locate import DATASETS_VARIABLE, search
 from sb3_dce.dce_probe import PROBE_BETAS, OfflineDCEProbe
 from sb3_dce.errors import ConfigError, DivergenceError
 from sb3_dce.experiments import results
@@ -106,6 +108,41 @@ def test_precision_of_a_call_is_that_of_its_runs(tmp_path: Path) -> None:
     ]
     with pytest.raises(ConfigError, match="must be one of 'float32', 'bf16-matmul', 'tf32'"):
         reproduce(replace(request, precision="bf16"), Console(quiet=True))
+
+
+def test_names_of_agents_and_data_that_a_grid_does_not_have_are_said(tmp_path: Path) -> None:
+    plain = Request(("fig-sac",), "cpu", tmp_path)
+    experiment = load_experiment("fig-sac")
+    scale = scale_of(experiment, plain)
+    with pytest.raises(
+        ConfigError, match=r"no dataset 'nonsense'\. It has halfcheetah-medium-v2, halfcheetah-medium-sb3; present"
+    ):
+        plan_runs(experiment, scale, replace(plain, datasets=("nonsense",)))
+    outcome = sb3_dce("reproduce", "fig-sac", "--agents", "SAC, alpha 1; BCC", "--out", str(tmp_path))
+    assert outcome.code == 2 and "no agent 'BCC'" in outcome.stderr, "a heading may have a comma"
+
+
+def test_rows_of_another_call_are_found_in_its_folder(tmp_path: Path) -> None:
+    for planned in small_plan("fig-cql-return", tmp_path, updates=4):
+        run(planned.spec)
+    results.write_rows(tmp_path / "rows" / "part.csv.gz", results.import_runs(tmp_path / "runs", "fig-cql-return"))
+    assert len(keys_of(results.read_folder(tmp_path))) == 2
+    pd.testing.assert_frame_equal(results.read_folder(tmp_path), results.read_folder(tmp_path / "rows"))
+
+
+def test_run_on_a_file_that_was_replaced_is_not_taken_as_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(DATASETS_VARIABLE, str(tmp_path / "data"))
+    (tmp_path / "data").mkdir()
+    tiny = search(resolve(TINY))
+    assert tiny is not None
+    name = "halfcheetah-medium-sb3.hdf5"
+    shutil.copy(tiny, tmp_path / "data" / name)
+    request = Request(("fig-sac",), "cpu", tmp_path / "out", ("halfcheetah-medium",), ("BC",), updates=2, eval_freq=2)
+    reproduce(request, QUIET)
+    with h5py.File(tmp_path / "data" / name, "r+") as file:
+        file.attrs["note"] = "another file"
+    with pytest.raises(ConfigError, match=r"a run with other settings: dataset=.*\(sha256 .{8}\) there"):
+        reproduce(request, QUIET)
 
 
 @pytest.mark.parametrize(("device", "message"), [("gpu", "must be one of 'auto', 'cpu', 'cuda'"), ("cuda", "no CUDA device")])

@@ -149,6 +149,7 @@ def test_runs_on_two_versions_of_a_file_are_two_runs(made_up: pd.DataFrame) -> N
     ("change", "message"),
     [
         ({"value": float("nan")}, "finite"),
+        ({"value": "abc"}, "finite"),
         ({"dataset_sha256": "abc"}, "64 hexadecimal digits"),
         ({"hyperparameters": "{beta: 2}"}, "JSON object"),
         ({"seed": -1}, "whole numbers"),

@@ -118,7 +118,7 @@ def resolve(name: str) -> DatasetSpec:
     did_you_mean = f"Did you mean {', '.join(close)}? " if close else ""
     raise DatasetError(
         f"unknown dataset {name!r}",
-        hint=f"{did_you_mean}All names: [spec.id for spec in sb3_dce.data.all_specs()]; a file of your own is given as a path",
+        hint=f"{did_you_mean}All names: sb3-dce datasets list --all; a file of your own is given as a path",
         key=name,
     )
 

@@ -1,14 +1,14 @@
 """
 What the rows say about an experiment: scores of a table's cells, curves of a figure's lines, and where they come from.
 
-All cells of a table row come from one file: where rows of two versions of a dataset are known, those of the one with more
-runs are taken, and the others are counted as left out. All have one length; runs of an agent that has only others are
-shown as what they are (:meth:`Evidence.of_other_length`) and take part in no comparison.
+All cells of a table row come from one file: where rows of two versions of a dataset are known, those of the file that is here
+are taken, else of the one with more runs, and the others are counted as left out. All have one length; runs of an agent that
+has only others are shown as what they are (:meth:`Evidence.of_other_length`) and take part in no comparison.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import cached_property
 
 import numpy as np
@@ -31,11 +31,19 @@ class Evidence:
     :param rows: any rows; those of other experiments count where the run is the same
     :param scale: may change settings of agents, and so decides which configurations are shown
     :param n_updates: only runs of this length; ``None`` takes for each dataset the length most of its variants have
+    :param hash_here: gives the SHA-256 of a dataset's file on this machine, ``None`` without one
     """
 
-    def __init__(self, experiment: Experiment, rows: pd.DataFrame, scale: Scale, n_updates: int | None = None) -> None:
+    def __init__(
+        self,
+        experiment: Experiment,
+        rows: pd.DataFrame,
+        scale: Scale,
+        n_updates: int | None = None,
+        hash_here: Callable[[str], str | None] = lambda _: None,
+    ) -> None:
         self.experiment, self.scale = experiment, scale
-        self._rows, self._n_updates = rows, n_updates
+        self._rows, self._n_updates, self._hash_here = rows, n_updates, hash_here
         self._selected: dict[str, pd.DataFrame] = {}
         self._others: dict[str, pd.DataFrame] = {}
         self._runs: dict[tuple[str, str], pd.DataFrame] = {}
@@ -120,6 +128,9 @@ class Evidence:
         runs = found[["dataset_sha256", "agent", "config_hash", "n_updates", "seed"]].drop_duplicates()
         if len(runs):
             sha = _commonest(runs["dataset_sha256"])
+            if (runs["dataset_sha256"] != sha).any():
+                here = self._hash_here(dataset_id)
+                sha = here if here is not None and here in set(runs["dataset_sha256"]) else sha
             ours = runs[runs["dataset_sha256"] == sha]
             if self._n_updates is not None:
                 length = self._n_updates

@@ -23,7 +23,7 @@ from sb3_dce import hyperparams
 from sb3_dce.agents import agent_class
 from sb3_dce.data.catalog import resolve
 from sb3_dce.data.locate import search
-from sb3_dce.errors import ConfigError, DatasetNotFoundError
+from sb3_dce.errors import ConfigError, DatasetError, DatasetNotFoundError
 from sb3_dce.experiments.configuration import config_hash, defaults_of, differences, row_of
 from sb3_dce.runs import RunSpec
 
@@ -315,10 +315,15 @@ def _chosen(experiment: Experiment, datasets: Sequence[str] | None) -> list[Grid
     if datasets is None:
         return list(experiment.datasets)
     by_id = {name: d for d in experiment.datasets for name in d.ids}
-    wanted = [resolve(name).id for name in datasets]
-    for name in wanted:
-        if name not in by_id:
-            raise ConfigError(f"{experiment.id} has no dataset {name!r}", key="--datasets", hint=f"It has {', '.join(by_id)}.")
+    wanted = []
+    for name in datasets:
+        try:
+            wanted.append(resolve(name).id)
+        except DatasetError:
+            wanted.append(name)
+        if wanted[-1] not in by_id:
+            hint = f"It has {', '.join(by_id)}; present, by itself, takes those that are here."
+            raise ConfigError(f"{experiment.id} has no dataset {name!r}", key="--datasets", hint=hint)
     return [d for d in experiment.datasets if any(by_id[name] is d for name in wanted)]
 
 

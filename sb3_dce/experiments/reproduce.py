@@ -15,6 +15,9 @@ from rich.console import Console
 from rich.table import Table
 
 from sb3_dce.checks import check_choice, check_ends_with_evaluation
+from sb3_dce.data.catalog import resolve
+from sb3_dce.data.hashes import file_sha256
+from sb3_dce.data.locate import search
 from sb3_dce.data.locking import exclusive
 from sb3_dce.errors import ConfigError
 from sb3_dce.experiments import results
@@ -34,9 +37,10 @@ from sb3_dce.experiments.pages import write_page
 from sb3_dce.experiments.reports import Report, count, make_report
 from sb3_dce.experiments.run import execute, is_complete
 from sb3_dce.experiments.tables import parts_of
+from sb3_dce.files import check_writable
 from sb3_dce.hyperparams import did_you_mean, full_name
 from sb3_dce.precision import PRECISIONS
-from sb3_dce.runs import RunSpec
+from sb3_dce.runs import RunSpec, refuse_other_run
 
 DEVICES = ("auto", "cpu", "cuda")
 ALL = "all"
@@ -101,6 +105,8 @@ def parse_ids(text: str) -> tuple[str, ...]:
     names = tuple(name.strip() for name in text.split(",") if name.strip())
     if not names:
         raise ConfigError("no experiment is named", key="id", hint="See sb3-dce reproduce --list, or take all.")
+    if ALL in names and names != (ALL,):
+        raise ConfigError(f"{ALL} stands alone, got {text!r}", key="id", hint=f"Take {ALL}, or name experiments.")
     return tuple(experiment_ids()) if names == (ALL,) else tuple(load_experiment(name).id for name in names)
 
 
@@ -120,11 +126,23 @@ def reproduce(request: Request, console: Console) -> dict[str, Report]:
     check_choice("--precision", request.precision, PRECISIONS)
     if request.device == "cuda" and not th.cuda.is_available():
         raise ConfigError("--device cuda, but PyTorch finds no CUDA device here", key="--device", hint="Leave it out.")
+    if request.report_only and (request.datasets or request.agents or request.seeds or request.first_seed):
+        hint = "It reports all rows: leave out --datasets, --agents, --seeds and --first-seed."
+        raise ConfigError("--report-only trains nothing", key="--report-only", hint=hint)
     experiments = [load_experiment(name) for name in request.ids]
     scales = {e.id: scale_of(e, request) for e in experiments}
     for folder in (*request.reuse, *request.imports):
         if not folder.is_dir():
             raise ConfigError("no such folder", where=str(folder), key="--reuse/--import", hint="Check the path.")
+    for folder in request.reuse:
+        if not results.has_rows(folder):
+            hint = "Name a folder with .csv.gz files, or one that reproduce wrote; runs are taken with --import."
+            raise ConfigError("no result rows in the folder", where=str(folder), key="--reuse", hint=hint)
+    for folder in request.imports:
+        if next(folder.rglob("config.yml"), None) is None:
+            raise ConfigError("no runs below the folder", where=str(folder), key="--import", hint="Name one that train wrote.")
+    if request.page is not None:
+        check_writable(request.page)
     if not request.report_only:
         request.out.mkdir(parents=True, exist_ok=True)
         # two calls with one folder take turns: they may have runs in common
@@ -135,15 +153,26 @@ def reproduce(request: Request, console: Console) -> dict[str, Report]:
         _keep_rows(rows, request, results.empty())
         # runs of an unfinished call with this folder are shown, and left for it to keep
         rows = results.merge([rows, results.import_runs(request.out / "runs", request.ids[0])])
+        if rows.empty:
+            console.print(f"no result rows in {request.out}/rows: nothing has been run", markup=False)
     evidences, reports = {}, {}
     for experiment in experiments:
         length = request.updates if request.report_only else scales[experiment.id].updates
-        evidence = Evidence(experiment, rows, scales[experiment.id], length)
+        evidence = Evidence(experiment, rows, scales[experiment.id], length, hash_here)
         evidences[experiment.id], reports[experiment.id] = evidence, _report(evidence, request.out, console)
     if request.page is not None:
         write_page(request.page, request.out, evidences, reports, _command(request))
         console.print(f"page   {request.page}", markup=False)
     return reports
+
+
+def hash_here(dataset_id: str) -> str | None:
+    """
+    :param dataset_id: id of the catalogue
+    :return: SHA-256 of its file on this machine, ``None`` if there is none
+    """
+    path = search(resolve(dataset_id))
+    return None if path is None else file_sha256(path)
 
 
 def _known(request: Request) -> pd.DataFrame:
@@ -156,7 +185,11 @@ def _train(request: Request, experiments: list[Experiment], scales: dict[str, Sc
     imported = results.merge(results.import_runs(folder, request.ids[0]) for folder in request.imports)
     known = results.merge([_known(request), imported])
     done = results.done_runs(known, planned)
+    for run in {run.spec.folder: run for run in planned}.values():
+        refuse_other_run(run.spec, Path(run.spec.folder))
     _say_plan(planned, done, scales, console)
+    if request.precision != "float32" and any(run.key in done or is_complete(run.spec) for run in planned):
+        console.print("complete runs are taken with the precision they have", markup=False)
     diverged = execute(planned, done, request.workers, request.device, request.ray_address, console)
     for text in diverged:
         console.print(f"diverged: {text}", markup=False)

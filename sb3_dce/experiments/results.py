@@ -208,12 +208,24 @@ def read_rows(path: Path) -> pd.DataFrame:
     return _ordered(rows)
 
 
+def has_rows(folder: Path) -> bool:
+    """
+    :param folder: any
+    :return: whether :func:`read_folder` finds files there
+    """
+    return bool(_row_files(folder))
+
+
 def read_folder(folder: Path) -> pd.DataFrame:
     """
-    :param folder: with ``.csv.gz`` files; need not exist
+    :param folder: with ``.csv.gz`` files in it or in ``rows/``; need not exist
     :return: all their rows, each run once
     """
-    return merge(read_rows(path) for path in sorted(folder.glob("*.csv.gz")))
+    return merge(read_rows(path) for path in _row_files(folder))
+
+
+def _row_files(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*.csv.gz")) or sorted((folder / "rows").glob("*.csv.gz"))
 
 
 def check_rows(rows: pd.DataFrame, where: str) -> None:
@@ -233,7 +245,7 @@ def check_rows(rows: pd.DataFrame, where: str) -> None:
     for name in ("n_updates", "seed", "step"):
         if not pd.api.types.is_integer_dtype(rows[name]) or (rows[name] < 0).any():
             refuse(f"{name} must be whole numbers from 0 up")
-    if not np.isfinite(rows["value"].to_numpy(dtype=float)).all():
+    if not pd.api.types.is_numeric_dtype(rows["value"]) or not np.isfinite(rows["value"].to_numpy(dtype=float)).all():
         refuse("value must be finite numbers")
     if not rows["dataset_sha256"].str.fullmatch(r"[0-9a-f]{64}").all():
         refuse("dataset_sha256 must be 64 hexadecimal digits")
