@@ -96,8 +96,9 @@ def refuse_divergence(means: dict[str, float], first: int, last: int) -> None:
     """
     bad = [name for name, value in means.items() if value != value or value in (float("inf"), float("-inf"))]
     if bad:
+        named = ", ".join(bad[:4]) + (f" and {len(bad) - 4} more" if len(bad) > 4 else "")  # in a few updates all of them
         raise DivergenceError(
-            f"training diverged between updates {first} and {last}: {', '.join(bad)} not finite",
+            f"training diverged between updates {first} and {last}: {named} not finite",
             hint="Check the dataset for huge values, lower learning_rate or beta, or set max_grad_norm.",
             index=last,
         )

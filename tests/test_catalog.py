@@ -67,7 +67,7 @@ def test_aliases_complete_the_version(name: str, dataset_id: str) -> None:
 
 
 def test_unknown_name_lists_close_matches() -> None:
-    with pytest.raises(DatasetError, match=r"walker2d-medium-v2.*all_specs"):
+    with pytest.raises(DatasetError, match=r"walker2d-medium-v2.*datasets list --all"):
         resolve("waker2d-medium-v2")
 
 
