@@ -321,6 +321,20 @@ def test_cause_of_a_loss_is_the_change_that_closes_the_gap() -> None:
     assert finding == "behind IQL by 20.0: survival condition broken (margin -0.50); c 0.5 closes 75%"
 
 
+def test_loss_is_not_explained_by_changes_that_were_not_run() -> None:
+    experiment = load_experiment("why-dce-loses")
+    # the row of this set has the learned temperature, so "temperature auto" is the same run and no change
+    known = {"IQL": [60.0], "DCE": [40.0], "temperature auto": [40.0]}
+    for scores_of, finding in (
+        (known, "behind IQL by 20.0: no change was run"),
+        ({**known, "beta 1": [41.0]}, "behind IQL by 20.0: none of the changes explains it"),
+        ({**known, "DCE": [61.0]}, "not behind (IQL 60.0)"),
+    ):
+        rows = table_rows(experiment, {CHEETAH: scores_of})
+        report = make_report(evidence_of(rows, "why-dce-loses"))
+        assert report.tables["changes"].rows[0][-1] == finding
+
+
 # -- facts without runs --------------------------------------------------------------------------------------------
 
 

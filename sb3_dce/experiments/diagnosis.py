@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from sb3_dce.experiments.evidence import Evidence
-from sb3_dce.experiments.grid import Variant
+from sb3_dce.experiments.grid import Variant, variant_hash
 from sb3_dce.experiments.tables import TextTable
 
 # A change counts as a cause if it closes this share of the distance to the better of BC and IQL.
@@ -93,13 +93,17 @@ def verdict_of(evidence: Evidence, dataset_id: str) -> str:
     if (evidence.start(variant, dataset_id, "data_n_terminals") or 0) > 0 and margin is not None and margin < 0:
         causes.append(f"survival condition broken (margin {margin:.2f})")
     gap = rivals[best] - dce
-    for name, score in scores.items():
-        if name not in ("DCE", *RIVALS) and score is not None and score - dce >= SHARE * gap:
+    own = variant_hash(variant, dataset_id, evidence.scale)
+    changes = [v for v in experiment.variants if v.algo == variant.algo and variant_hash(v, dataset_id, evidence.scale) != own]
+    changed = {v.name: score for v in changes if (score := scores[v.name]) is not None}
+    for name, score in changed.items():
+        if score - dce >= SHARE * gap:
             causes.append(f"{name} closes {(score - dce) / gap:.0%}")
     half, end = halves(evidence, variant, dataset_id)
     if half is not None and end is not None and end - half >= SHARE * gap:
         causes.append(f"still rising ({half:.1f} at half time)")
-    return f"behind {best} by {gap:.1f}: " + ("; ".join(causes) if causes else "none of the changes explains it")
+    nothing = "none of the changes explains it" if changed else "no change was run"
+    return f"behind {best} by {gap:.1f}: {'; '.join(causes) or nothing}"
 
 
 def lowest_margin(evidence: Evidence, variant: Variant, dataset_id: str) -> float | None:
@@ -118,13 +122,14 @@ def halves(evidence: Evidence, variant: Variant, dataset_id: str) -> tuple[float
     :param evidence: rows
     :param variant: agent
     :param dataset_id: data
-    :return: score at half of the run and at its end, each the mean of the last five evaluations until then
+    :return: score at half of the run and at its end, each the mean of the evaluations of a tenth of the run before
     """
     curve = evidence.curve(variant, dataset_id, "score")
     if len(curve) < 2:
         return None, None
     middle = curve[curve.index <= (evidence.n_updates(dataset_id) or 0) / 2]
-    means = [None if part.empty else float(part.tail(5).mean().mean()) for part in (middle, curve)]
+    n = max(1, len(curve) // 10)
+    means = [None if part.empty else float(part.tail(n).mean().mean()) for part in (middle, curve)]
     return means[0], means[1]
 
 

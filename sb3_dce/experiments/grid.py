@@ -323,7 +323,7 @@ def _chosen(experiment: Experiment, datasets: Sequence[str] | None) -> list[Grid
             wanted.append(name)
         if wanted[-1] not in by_id:
             hint = f"It has {', '.join(by_id)}; present, by itself, takes those that are here."
-            raise ConfigError(f"{experiment.id} has no dataset {name!r}", key="--datasets", hint=hint)
+            raise ConfigError(f"{experiment.id} has no dataset {wanted[-1]!r}", key="--datasets", hint=hint)
     return [d for d in experiment.datasets if any(by_id[name] is d for name in wanted)]
 
 
