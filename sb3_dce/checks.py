@@ -148,7 +148,7 @@ def check_policy_kwargs(given: Any, policy_class: type, settings: dict[str, Any]
             raise ConfigError(f"{name}={value!r} in policy_kwargs would contradict the agent", key=name, hint=hint)
         if name == "net_arch" and value is not None:
             check_widths("net_arch", value)
-        if name == "activation_fn" and not isinstance(value, type):
+        if name == "activation_fn" and not callable(value):
             hint = "For example torch.nn.Tanh."
             raise ConfigError(f"activation_fn must be a class of torch.nn, got {value!r}", key="activation_fn", hint=hint)
         if name == "n_critics":
