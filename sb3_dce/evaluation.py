@@ -131,9 +131,10 @@ def evaluation_seed(run_seed: int, index: int) -> int:
     """
     :param run_seed: seed of the run
     :param index: number of the evaluation within the run
-    :return: seed of its first episode
+    :return: seed of its first episode; no other evaluation of any run has it
     """
-    return SEEDS_PER_EVALUATION * (index + 1000 * run_seed)
+    block, index = divmod(index, 1000)  # runs that are evaluated more often go on beyond the blocks of all run seeds
+    return SEEDS_PER_EVALUATION * (index + 1000 * (run_seed + 2**32 * block))
 
 
 class EvaluationCallback(BaseCallback):

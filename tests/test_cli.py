@@ -16,13 +16,12 @@ import numpy as np
 import pytest
 import yaml
 from commands import Outcome, sb3_dce
-from stable_baselines3.common.evaluation import evaluate_policy
 from typer.testing import CliRunner
 
 from sb3_dce import OfflineDCE, cli
 from sb3_dce.data import find_file, load_transitions
-from sb3_dce.envs import make_env_if_possible
 from sb3_dce.errors import ConfigError
+from sb3_dce.evaluation import evaluate, evaluation_seed, rollouts_of
 
 TINY = "halfcheetah-tiny-sb3"
 FAST = ("--set", "policy_kwargs={net_arch: [16, 16]}", "--set", "execution=eager", "--set", "batch_size=32")
@@ -80,9 +79,11 @@ def test_the_saved_model_evaluates_as_the_run_reported(trained: tuple[Path, Outc
     run = cwd / "runs" / f"dce-{TINY}" / "seed_0"
     result = sb3_dce("evaluate", str(run / "model.zip"), "--episodes", "2")
     assert result.code == 0 and "normalised score" in result.stdout, result
-    model = OfflineDCE.load(run / "model.zip")
-    returns, _ = evaluate_policy(model, make_env_if_possible(TINY), n_eval_episodes=1, warn=False)
-    assert np.isfinite(returns)
+    reported = json.loads((run / "result.json").read_text())
+    rollouts = rollouts_of(TINY, len(reported["returns"]))
+    assert rollouts is not None
+    seed = evaluation_seed(0, reported["n_updates"] // reported["config"]["eval_freq"])
+    assert list(evaluate(OfflineDCE.load(run / "model.zip"), rollouts, seed).returns) == reported["returns"]
 
 
 def test_the_same_command_does_not_repeat_finished_runs(

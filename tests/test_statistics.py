@@ -7,6 +7,7 @@ import pytest
 
 from sb3_dce.experiments.paper import gym_rows, leaders, paper_score, paper_scores, paper_total
 from sb3_dce.experiments.statistics import (
+    N_RESAMPLES,
     Interval,
     bootstrap_interval,
     iqm,
@@ -97,3 +98,22 @@ def test_printed_tables_are_read_whole() -> None:
     assert kitchen is not None and kitchen.mean == pytest.approx(157.8)
     assert paper_total("PBRL", ["kitchen-mixed-v0"]) is None, "a dash is no number"
     assert sum(leader == "DCE" for name, leader in leaders(gym_rows()).items() if "expert" not in name) == 5
+
+
+def test_bootstrap_interval_has_the_percentiles_of_the_binomial_distribution() -> None:
+    # Bin(50, 1/2): P(X <= 17) = 0.016, P(X <= 18) = 0.032
+    assert bootstrap_interval([np.repeat([0.0, 1.0], 25)]) == pytest.approx((18 / 50, 32 / 50))
+    # as many draws as seeds: Bin(4, 1/4), P(X = 4) = 0.004, P(X >= 3) = 0.051
+    assert bootstrap_interval([np.array([0.0, 0.0, 0.0, 1.0])]) == (0.0, 0.75)
+    assert N_RESAMPLES == 2000, "the least that the protocol asks for"
+
+
+def test_intervals_that_touch_overlap() -> None:
+    assert Interval(0.0, 1.0).overlaps(Interval(1.0, 2.0)) and Interval(1.0, 2.0).overlaps(Interval(0.0, 1.0))
+    assert not Interval(0.0, 1.0).overlaps(Interval(1.1, 2.0))
+
+
+def test_iqm_and_profile_are_over_all_runs_and_not_over_tasks() -> None:
+    # 0 0 [0 0 1 2] 3 100
+    assert iqm([np.zeros(4), np.array([1.0, 2.0, 3.0, 100.0])]) == 0.75
+    assert performance_profile([np.array([10.0]), np.full(3, 20.0)], np.array([15.0])).tolist() == [0.75]

@@ -379,3 +379,12 @@ def test_threshold_may_change_at_load(hdf5_file: Path, tmp_path: Path) -> None:
     model = OfflineCQL("MlpPolicy", dataset=hdf5_file, policy_kwargs={"net_arch": [8]}, lagrange_threshold=1.0)
     model.save(tmp_path / "model.zip")
     assert OfflineCQL.load(tmp_path / "model.zip", lagrange_threshold=2.0).coefficients(0)["lagrange_threshold"] == 2.0
+
+
+def test_multiplier_is_never_above_a_million(transitions: Transitions) -> None:
+    model = make_model(transitions, lagrange_threshold=0.0)
+    with th.no_grad():
+        model.log_lagrange.fill_(20.0)  # exp(20) = 4.9e8
+    model.train(1, 8)
+    assert model.read_metrics()["lagrange"] == pytest.approx(1e6)
+    assert float(model.log_lagrange.detach()) == 20.0, "beyond the limit there is no gradient"

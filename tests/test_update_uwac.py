@@ -549,3 +549,20 @@ def test_saved_model_goes_on_with_multiplier_and_power_iteration(hdf5_file: Path
     for one in (model, loaded):
         one.learn(3, reset_num_timesteps=False)
     assert largest_difference(tensors_of(model), tensors_of(loaded)) == 0.0
+
+
+def test_deviation_of_the_action_models_latents_is_bounded(transitions: Transitions) -> None:
+    vae = make_model(transitions).vae
+    s, a, noise = th.zeros(3, 5).double(), th.zeros(3, 2).double(), th.zeros(3, vae.latent_dim).double()
+    for bias, bound in ((-50.0, -4.0), (50.0, 15.0)):
+        with th.no_grad():
+            vae.log_std.weight.zero_()
+            vae.log_std.bias.fill_(bias)
+        assert vae(s, a, noise)[2].unique().tolist() == [bound]
+
+
+def test_a_new_layer_is_nearly_normalised() -> None:
+    th.manual_seed(0)
+    layer = SpectralLinear(4, 40, 30)
+    largest = th.linalg.svdvals(layer.normalized(layer.left, layer.right).detach())[:, 0]
+    assert (largest < 1.05).all(), largest

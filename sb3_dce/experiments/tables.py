@@ -17,6 +17,7 @@ from sb3_dce.experiments.evidence import Evidence, at_end, curve_of
 from sb3_dce.experiments.grid import Variant, source_of
 from sb3_dce.experiments.paper import paper_score, paper_scores
 from sb3_dce.experiments.statistics import (
+    N_RESAMPLES,
     Interval,
     bootstrap_interval,
     iqm,
@@ -238,8 +239,8 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
         )
     note = (
         f"Over the {len(ids)} data sets on which all of these agents have runs of one length. The interval is a stratified "
-        "bootstrap over seeds within data sets (2,000 resamples; none with one seed); the deviation of the total takes the "
-        "rows as independent."
+        f"bootstrap over seeds within data sets ({N_RESAMPLES:,} resamples; none with one seed); the deviation of the total "
+        "takes the rows as independent."
     )
     return TextTable(header, tuple(rows), f"{evidence.caption(ids, variants)} {note}")
 

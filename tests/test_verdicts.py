@@ -1,0 +1,169 @@
+"""Rules of the verdicts: on numbers that bear a claim out, and on numbers that break it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pandas as pd
+import pytest
+from result_rows import run_rows, table_rows
+
+from sb3_dce.experiments import results
+from sb3_dce.experiments.claims import claim_table
+from sb3_dce.experiments.evidence import Evidence
+from sb3_dce.experiments.grid import load_experiment
+from sb3_dce.experiments.reports import reproduction
+from sb3_dce.experiments.verdicts import HELD, NOT_HELD, verdicts
+from sb3_dce.theory import shift_factor
+
+CHEETAH = "halfcheetah-medium-sb3"
+
+
+def outcomes(name: str, rows: pd.DataFrame) -> dict[str, str]:
+    experiment = load_experiment(name)
+    return {v.claim: v.outcome for v in verdicts(Evidence(experiment, rows, experiment.scales["cpu"]))}
+
+
+def one_of(found: dict[str, str], part: str) -> str:
+    (outcome,) = [outcome for claim, outcome in found.items() if part in claim]
+    return outcome
+
+
+def scored(name: str, by_data: dict[str, dict[str, float]], metric: str = "score") -> pd.DataFrame:
+    experiment = load_experiment(name)
+    return results.merge(
+        run_rows(experiment, variant, data, 0, curves={metric: [value] * 10}, n_updates=1000)
+        for data, values in by_data.items()
+        for variant, value in values.items()
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "metric", "values", "claim"),
+    [
+        (
+            "fig-alpha-return",
+            "score",
+            {"DCE, alpha 1": 50, "DCE, alpha 3": 40, "Eq. 18, alpha 1": 50, "Eq. 18, alpha 3": 60},
+            "At alpha 3 both are below",
+        ),
+        (
+            "fig-alpha-return",
+            "score",
+            {"DCE, alpha 3": 30, "Eq. 18, alpha 3": 40},
+            "At alpha 3 DCE is above",
+        ),
+        ("fig-cql-return", "score", {"DCE": 50, "Eq. 18": 40}, "Eq. 18 is better on halfcheetah"),
+        ("fig-cql-q", "q_data", {"expectile 0.5": 3, "expectile 0.7": 2, "expectile 0.9": 1}, "higher expectile"),
+        ("fig-sac", "score", {"SAC, alpha 1": 5, "SAC with V, alpha 1": 4}, "SAC with V returns more than SAC, alpha 1"),
+        ("fig-sac", "score", {"SAC, alpha 1": 5, "SAC with V, alpha 1": 45, "BC": 40}, "V alone is not enough, alpha 1"),
+        ("fig-sac", "q_data", {"SAC, alpha 1": 100, "SAC with V, alpha 1": 60}, "far lower (paper: 4000 and 400), alpha 1"),
+        ("fig-alpha", "ent_coef", {f"beta {b}": 1 - b / 10 for b in (0, 1, 2, 4, 8)}, "rises with beta"),
+        (
+            "fig-tau",
+            "score",
+            {f"expectile 0.{n}": 2 * n for n in (5, 6, 7, 8, 9)} | {"expectile 0.5": 30},
+            "little difference on half",
+        ),
+    ],
+)
+def test_claims_fail_on_numbers_that_break_them(name: str, metric: str, values: dict[str, float], claim: str) -> None:
+    assert one_of(outcomes(name, scored(name, {CHEETAH: values}, metric)), claim) == NOT_HELD
+
+
+@pytest.mark.parametrize(
+    ("name", "metric", "values", "claim"),
+    [
+        ("fig-alpha-return", "score", {"DCE, alpha 3": 50, "Eq. 18, alpha 3": 40}, "At alpha 3 DCE is above"),
+        ("fig-cql-return", "score", {"DCE": 40, "Eq. 18": 50}, "Eq. 18 is better on halfcheetah"),
+        ("fig-cql-q", "q_data", {"expectile 0.5": 1, "expectile 0.7": 2, "expectile 0.9": 3}, "higher expectile"),
+        ("fig-sac", "score", {"SAC, alpha 1": 5, "SAC with V, alpha 1": 6}, "SAC with V returns more than SAC, alpha 1"),
+        ("fig-sac", "score", {"SAC, alpha 1": 5, "SAC with V, alpha 1": 35, "BC": 40}, "V alone is not enough, alpha 1"),
+        ("fig-sac", "q_data", {"SAC, alpha 1": 100, "SAC with V, alpha 1": 40}, "far lower (paper: 4000 and 400), alpha 1"),
+        ("fig-alpha", "ent_coef", {f"beta {b}": b / 10 for b in (0, 1, 2, 4, 8)}, "rises with beta"),
+        ("fig-tau", "score", {f"expectile 0.{n}": n for n in (5, 6, 7, 8, 9)}, "little difference on half"),
+    ],
+)
+def test_claims_hold_on_numbers_that_bear_them_out(name: str, metric: str, values: dict[str, float], claim: str) -> None:
+    assert one_of(outcomes(name, scored(name, {CHEETAH: values}, metric)), claim) == HELD
+
+
+@pytest.mark.parametrize(("sign", "outcome"), [(-1.0, HELD), (1.0, NOT_HELD)])
+def test_values_outside_of_the_data_are_ordered_by_beta(sign: float, outcome: str) -> None:
+    experiment = load_experiment("fig-ood")
+    curves = {f"probe{b}_{kind}": [sign * b] * 10 for b in (0, 1, 2, 4, 8) for kind in ("policy", "max", "min")}
+    curves |= {f"probe{b}_data": [0.0] * 10 for b in (0, 1, 2, 4, 8)}
+    found = outcomes("fig-ood", run_rows(experiment, "probe", CHEETAH, 0, curves=curves))
+    assert set(found.values()) == {outcome} and len(found) == 3
+
+
+@pytest.mark.parametrize(("factors", "outcome"), [((1.0, 1.0, 1.0), HELD), ((0.9, 1.0, 1.3), NOT_HELD)])
+def test_bound_and_shift_are_judged_by_the_worst_beta(factors: tuple[float, ...], outcome: str) -> None:
+    experiment, steps = load_experiment("bounds"), [10_000 * (i + 1) for i in range(10)]
+    parts = []
+    for variant, factor in zip(experiment.variants, (1.0, *factors), strict=True):
+        unit = variant.set["beta"] / 2
+        lowered = [factor * unit * shift_factor(step - 5000, 0.99, 0.005) for step in steps]
+        curves = {"q_data": [400.0 - x for x in lowered], "value": [399.0 - (x - factor * unit) / 0.99 for x in lowered]}
+        parts.append(run_rows(experiment, variant.name, CHEETAH, 0, curves=curves, n_updates=100_000))
+    found = outcomes("bounds", results.merge(parts))
+    assert one_of(found, "at most the bound") == outcome and one_of(found, "Q on the data is lowered") == outcome
+
+
+@pytest.mark.parametrize(
+    ("pairs", "outcome"), [(((30, 20), (10, 10)), HELD), (((30, 20), (5, 10)), NOT_HELD), (((9, 9), (9, 9)), NOT_HELD)]
+)
+def test_dropout_has_to_help_somewhere_and_hurt_nowhere(pairs: Any, outcome: str) -> None:
+    adroit = load_experiment("table-adroit-kitchen")
+    data = ("pen-human-v0", "door-human-v0")
+    rows = table_rows(
+        adroit,
+        {d: {"DCE": [float(a)] * 2, "DCE without dropout": [float(b)] * 2} for d, (a, b) in zip(data, pairs, strict=True)},
+    )
+    assert one_of(outcomes("table-adroit-kitchen", rows), "Dropout of the critics") == outcome
+
+
+def test_best_on_every_set_is_not_best_on_one() -> None:
+    table = load_experiment("table1")
+    agents = {v.name: [40.0, 42.0] for v in table.variants}
+    names = [f"halfcheetah-{kind}-sb3" for kind in ("random", "medium", "medium-replay", "medium-expert")]
+    rows = table_rows(table, {n: {**agents, "DCE": [90.0, 92.0] if n == names[0] else [10.0, 12.0]} for n in names})
+    assert one_of(outcomes("table1", rows), "C4") == NOT_HELD
+
+
+def test_claims_on_seeds_and_speed() -> None:
+    table = load_experiment("table1")
+    for spread, seconds, expected in ((30.0, (10.0, 90.0), HELD), (1.0, (90.0, 10.0), NOT_HELD)):
+        parts = [run_rows(table, "DCE", CHEETAH, s, 40.0 + s * spread, seconds=seconds[0]) for s in range(2)]
+        rows = results.merge([*parts, run_rows(table, "CQL", CHEETAH, 0, 40.0, seconds=seconds[1])])
+        lines = {row[0]: row[2] for row in claim_table({"table1": Evidence(table, rows, table.scales["cpu"])}, {}).rows}
+        assert (lines["C3"], lines["C7"]) == (expected, expected)
+
+
+def test_a_score_within_the_papers_deviation_is_reproduced() -> None:
+    table = load_experiment("table1")  # the paper: 75.9 ± 12.3
+    rows = table_rows(table, {"hopper-medium-v2": {"DCE": [65.0, 66.0]}}, n_updates=1_000_000)
+    assert reproduction(Evidence(table, rows, table.scales["full"])).numbers.startswith("1 of 1 rows")
+
+
+@pytest.mark.parametrize(("alphas", "outcome"), [((0.2, 0.3, 0.5, 0.25), HELD), ((0.2, 0.3, 0.35, 0.25), NOT_HELD)])
+def test_alpha_differs_between_data_sets_by_a_factor(alphas: tuple[float, ...], outcome: str) -> None:
+    experiment = load_experiment("fig-alpha")
+    data = [entry.twin for entry in experiment.datasets[:4]]
+    rows = scored("fig-alpha", {str(d): {"beta 4": a} for d, a in zip(data, alphas, strict=True)}, "ent_coef")
+    assert one_of(outcomes("fig-alpha", rows), "between data sets (MuJoCo)") == outcome
+
+
+@pytest.mark.parametrize(("slope", "outcome"), [(0.5, HELD), (2.0, NOT_HELD)])
+def test_flatter_curve_is_the_one_that_varies_less(slope: float, outcome: str) -> None:
+    experiment = load_experiment("fig-cql-q")
+    curves = {"expectile 0.7": [float(i) for i in range(10)], "without policy": [slope * i for i in range(10)]}
+    rows = results.merge(run_rows(experiment, name, CHEETAH, 0, curves={"q_data": q}) for name, q in curves.items())
+    assert one_of(outcomes("fig-cql-q", rows), "Q is flatter") == outcome
+
+
+@pytest.mark.parametrize(("scores", "outcome"), [([20.0, 60.0], HELD), ([38.0, 42.0], NOT_HELD)])
+def test_constant_alpha_varies_if_one_set_varies(scores: list[float], outcome: str) -> None:
+    adroit = load_experiment("table-adroit-kitchen")
+    rows = table_rows(adroit, {"pen-human-v0": {"DCE": scores}, "hammer-human-v0": {"DCE": [40.0, 41.0]}})
+    assert one_of(outcomes("table-adroit-kitchen", rows), "constant alpha") == outcome
