@@ -25,7 +25,7 @@ import sb3_dce
 from sb3_dce.agents import agent_class
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.data import find_file
-from sb3_dce.data.hashes import file_sha256
+from sb3_dce.data.hashes import file_sha256, sha256_once
 from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError
 from sb3_dce.evaluation import Evaluation, EvaluationCallback, catalogue_id, rollouts_of, write_evaluations
 from sb3_dce.files import write_atomically
@@ -236,7 +236,7 @@ def refuse_other_run(spec: RunSpec, folder: Path) -> None:
         differing.append("n_updates")
     changes = [f"{key}={begun.get(key)!r} there, {wanted[key]!r} now" for key in differing]
     # The same data may be named otherwise: by an id, from another folder, after a move.
-    there, now = str(data.get("sha256")), file_sha256(find_file(spec.dataset)[0])
+    there, now = str(data.get("sha256")), sha256_once(find_file(spec.dataset)[0])
     if there != now:
         changes.append(f"dataset={begun.get('dataset')!r} (sha256 {there[:8]}) there, {spec.dataset!r} ({now[:8]}) now")
     if changes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Mapping
 from functools import lru_cache
 from os import PathLike
@@ -54,6 +55,22 @@ def file_sha256(path: str | PathLike[str]) -> str:
         while block := file.read(2**20):
             digest.update(block)
     return digest.hexdigest()
+
+
+def sha256_once(path: str | PathLike[str]) -> str:
+    """
+    :func:`file_sha256` for callers that ask for one file again and again: a large one takes a second.
+
+    :param path: file
+    :return: SHA-256, from memory as long as size, time of change and inode are what they were
+    """
+    state = os.stat(path)
+    return _remembered(os.path.abspath(path), state.st_size, state.st_mtime_ns, state.st_ino)
+
+
+@lru_cache(maxsize=64)
+def _remembered(path: str, *_: int) -> str:
+    return file_sha256(path)
 
 
 @lru_cache(maxsize=8)

@@ -16,7 +16,7 @@ from rich.table import Table
 
 from sb3_dce.checks import check_choice, check_ends_with_evaluation
 from sb3_dce.data.catalog import resolve
-from sb3_dce.data.hashes import file_sha256
+from sb3_dce.data.hashes import sha256_once
 from sb3_dce.data.locate import search
 from sb3_dce.data.locking import exclusive
 from sb3_dce.errors import ConfigError
@@ -172,7 +172,7 @@ def hash_here(dataset_id: str) -> str | None:
     :return: SHA-256 of its file on this machine, ``None`` if there is none
     """
     path = search(resolve(dataset_id))
-    return None if path is None else file_sha256(path)
+    return None if path is None else sha256_once(path)
 
 
 def _known(request: Request) -> pd.DataFrame:

@@ -21,7 +21,7 @@ import pandas as pd
 
 from sb3_dce.data import find_file
 from sb3_dce.data.catalog import resolve
-from sb3_dce.data.hashes import file_sha256
+from sb3_dce.data.hashes import sha256_once
 from sb3_dce.data.locate import short_name
 from sb3_dce.errors import CheckpointError, SB3DCEError
 from sb3_dce.evaluation import catalogue_id, read_evaluations
@@ -158,13 +158,10 @@ def done_runs(rows: pd.DataFrame, planned: Iterable[PlannedRun]) -> set[tuple[An
     counts = rows[rows["metric"] == "n_episodes"]
     episodes = dict(zip(counts[RUN_KEY].itertuples(index=False, name=None), counts["value"], strict=True))
     known = set(rows[RUN_KEY].itertuples(index=False, name=None))
-    present: dict[str, str] = {}
     done = set()
     for run in planned:
         dataset, *others = run.key
-        if dataset not in present:  # once for all runs on it: a file can be large
-            present[dataset] = file_sha256(find_file(dataset)[0])
-        key = (dataset, present[dataset], *others)
+        key = (dataset, sha256_once(find_file(dataset)[0]), *others)
         # a run without a simulator has no evaluation, and one that diverged perhaps not the last
         if key in known and (key in lost or key not in scored or episodes.get(key, 0) >= run.spec.n_eval_episodes):
             done.add(run.key)
