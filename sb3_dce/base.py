@@ -28,10 +28,11 @@ from sb3_dce.buffers import OfflineReplayBuffer
 from sb3_dce.checks import (
     callback_frequencies,
     check_choice,
+    check_device,
     check_flags,
     check_number,
     check_policy_kwargs,
-    check_seed_and_device,
+    check_seed,
     check_spaces,
     check_steps,
 )
@@ -111,7 +112,8 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         device: th.device | str,
         needs_env: bool,
     ) -> None:
-        check_seed_and_device(seed, device)
+        check_seed(seed)
+        check_device(device)
         self.d4rl_compat = d4rl_compat
         spec = self._remember_dataset(dataset)
         if env is None and needs_env:

@@ -74,19 +74,25 @@ def check_flags(owner: object) -> None:
     :raises ConfigError: if one is not
     """
     for name, parameter in inspect.signature(type(owner)).parameters.items():
-        value = getattr(owner, name, None)
-        if parameter.annotation == "bool" and hasattr(owner, name) and not isinstance(value, (bool, np.bool_)):
+        value = getattr(owner, name, False)  # not every argument is kept
+        if parameter.annotation == "bool" and not isinstance(value, (bool, np.bool_)):
             raise ConfigError(f"{name} must be True or False, got {value!r}", key=name)
 
 
-def check_seed_and_device(seed: Any, device: Any) -> None:
+def check_seed(seed: Any) -> None:
     """
     :param seed: ``None`` or a whole number that NumPy and PyTorch take
-    :param device: as PyTorch names it, or "auto"
-    :raises ConfigError: if one of them is something else, or names a CUDA device where there is none
+    :raises ConfigError: if it is something else
     """
     if seed is not None:
         check_number("seed", seed, 0, 2**32 - 1, integer=True, hint="None draws one.")
+
+
+def check_device(device: Any) -> None:
+    """
+    :param device: as PyTorch names it, or "auto"
+    :raises ConfigError: if it is something else, or a CUDA device where there is none
+    """
     if device == "auto":
         return
     try:

@@ -25,7 +25,7 @@ import sb3_dce
 from sb3_dce.agents import agent_class
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.data import find_file
-from sb3_dce.data.hashes import file_sha256, sha256_once
+from sb3_dce.data.hashes import sha256_once
 from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError
 from sb3_dce.evaluation import Evaluation, EvaluationCallback, catalogue_id, rollouts_of, write_evaluations
 from sb3_dce.files import write_atomically
@@ -259,9 +259,9 @@ def check_before_running(specs: Sequence[RunSpec]) -> None:
     for spec in specs:
         folder = Path(spec.folder)
         refuse_other_run(spec, folder)
-        read_divergence(folder)
+        ended = read_divergence(folder) is not None or read_result(folder) is not None
         settings = (spec.algo, spec.dataset, spec.overrides)
-        if settings in made or read_result(folder) is not None or (folder / "checkpoint.zip").is_file():
+        if ended or settings in made or (folder / "checkpoint.zip").is_file():
             continue
         made.append(settings)
         try:
@@ -338,7 +338,7 @@ def write_config(spec: RunSpec, model: OfflineAlgorithm, folder: Path, device: s
     config = {
         "run": _config(spec),
         "command": " ".join(["sb3-dce", *sys.argv[1:]]) if Path(sys.argv[0]).name == "sb3-dce" else None,
-        "dataset": {"name": model.dataset, "sha256": file_sha256(path), **(model.dataset_statistics or {})},
+        "dataset": {"name": model.dataset, "sha256": sha256_once(path), **(model.dataset_statistics or {})},
         "hyperparameters": hyperparameters,
         "versions": {
             "sb3_dce": sb3_dce.__version__,

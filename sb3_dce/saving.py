@@ -105,8 +105,7 @@ class SavingMixin(OffPolicyAlgorithm):
             (changed) configuration
         """
         hyperparams.check_keys(cls, kwargs, where=f"{cls.__name__}.load")
-        source = path if isinstance(path, io.IOBase) else existing_zip(Path(path))
-        cls._refuse_other_agents(source)
+        source = cls._own_file(path)
         try:
             return super().load(source, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         except (zipfile.BadZipFile, pickle.UnpicklingError, EOFError, RuntimeError) as error:
@@ -115,7 +114,9 @@ class SavingMixin(OffPolicyAlgorithm):
             ) from error
 
     @classmethod
-    def _refuse_other_agents(cls, source: Path | io.IOBase) -> None:
+    def _own_file(cls, path: str | Path | io.BufferedIOBase) -> Path | io.BufferedIOBase:
+        """The file that is there, or the opened one, if it holds a model of this class."""
+        source = path if isinstance(path, io.IOBase) else existing_zip(Path(path))
         saved = saved_algo(source)
         if saved != cls.algo_name:
             raise CheckpointError(
@@ -124,6 +125,7 @@ class SavingMixin(OffPolicyAlgorithm):
                 path=None if isinstance(source, io.IOBase) else source,
                 hint="Load it with the class it was saved from.",
             )
+        return source
 
     def set_parameters(
         self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
@@ -137,9 +139,8 @@ class SavingMixin(OffPolicyAlgorithm):
         :raises CheckpointError: if the parameters belong to another agent or configuration
         """
         if not isinstance(load_path_or_dict, dict):
-            source = load_path_or_dict if isinstance(load_path_or_dict, io.IOBase) else existing_zip(Path(load_path_or_dict))
-            self._refuse_other_agents(source)
-        if isinstance(load_path_or_dict, dict) and exact_match:
+            self._own_file(load_path_or_dict)
+        elif exact_match:
             expected, got = set(self._get_torch_save_params()[0]), set(load_path_or_dict)
             if expected != got:
                 # Not a ValueError: SB3's load() would take one for an old DQN file and end in a bare KeyError.
@@ -177,7 +178,7 @@ def existing_zip(path: Path) -> Path:
     raise CheckpointError("no such file", where=str(path), path=path, hint="Give the path of a saved model, a .zip file.")
 
 
-def saved_algo(path: Path | io.IOBase) -> str | None:
+def saved_algo(path: Path | io.BufferedIOBase) -> str | None:
     """
     Which agent a file belongs to; nothing in it is unpickled.
 
@@ -197,7 +198,7 @@ def saved_algo(path: Path | io.IOBase) -> str | None:
     return saved.get("algo") if isinstance(saved, dict) else None
 
 
-def _name_of(source: Path | io.IOBase) -> str:
+def _name_of(source: Path | io.BufferedIOBase) -> str:
     return str(getattr(source, "name", "stream")) if isinstance(source, io.IOBase) else str(source)
 
 

@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-import torch as th
 from rich.console import Console
 from rich.table import Table
 
-from sb3_dce.checks import check_choice, check_ends_with_evaluation
+from sb3_dce.checks import check_choice, check_device, check_ends_with_evaluation
 from sb3_dce.data.catalog import resolve
 from sb3_dce.data.hashes import sha256_once
 from sb3_dce.data.locate import search
@@ -124,8 +123,7 @@ def reproduce(request: Request, console: Console) -> dict[str, Report]:
         raise ConfigError(f"no scale {request.scale!r}", key="--scale", hint=hint)
     check_choice("--device", request.device, DEVICES)
     check_choice("--precision", request.precision, PRECISIONS)
-    if request.device == "cuda" and not th.cuda.is_available():
-        raise ConfigError("--device cuda, but PyTorch finds no CUDA device here", key="--device", hint="Leave it out.")
+    check_device(request.device)
     if request.report_only and (request.datasets or request.agents or request.seeds or request.first_seed):
         hint = "It reports all rows: leave out --datasets, --agents, --seeds and --first-seed."
         raise ConfigError("--report-only trains nothing", key="--report-only", hint=hint)
@@ -187,9 +185,7 @@ def _train(request: Request, experiments: list[Experiment], scales: dict[str, Sc
     done = results.done_runs(known, planned)
     for run in {run.spec.folder: run for run in planned}.values():
         refuse_other_run(run.spec, Path(run.spec.folder))
-    _say_plan(planned, done, scales, console)
-    if request.precision != "float32" and any(run.key in done or is_complete(run.spec) for run in planned):
-        console.print("complete runs are taken with the precision they have", markup=False)
+    _say_plan(planned, done, scales, request.precision, console)
     diverged = execute(planned, done, request.workers, request.device, request.ray_address, console)
     for text in diverged:
         console.print(f"diverged: {text}", markup=False)
@@ -271,13 +267,17 @@ def _with_precision(spec: RunSpec, precision: str) -> RunSpec:
     return replace(spec, overrides={**spec.overrides, "precision": precision})
 
 
-def _say_plan(planned: list[PlannedRun], done: set[tuple[Any, ...]], scales: dict[str, Scale], console: Console) -> None:
+def _say_plan(
+    planned: list[PlannedRun], done: set[tuple[Any, ...]], scales: dict[str, Scale], precision: str, console: Console
+) -> None:
     runs = {run.spec.folder: run for run in planned}
     complete = sum(run.key in done or is_complete(run.spec) for run in runs.values())
     data = ", ".join(dict.fromkeys(run.spec.dataset for run in runs.values()))
     if runs:
         lengths = ", ".join(dict.fromkeys(f"{run.spec.n_updates:,}" for run in runs.values()))
         console.print(f"{len(runs)} runs of {lengths} gradient steps, {complete} of them complete; data: {data}", markup=False)
+    if complete and precision != "float32":
+        console.print("complete runs are taken with the precision they have", markup=False)
     small = next((scale for scale in scales.values() if scale.set), None)
     if small is not None and runs:
         console.print(
