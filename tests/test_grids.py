@@ -156,8 +156,9 @@ def test_what_is_the_same_run_has_one_folder_in_all_experiments(data_folder: Pat
     assert folders["fig-beta", "beta 0"] == folders["fig-sac", "SAC with V, alpha 1"] == folders["bounds", "beta 0"]
     assert table["DCE"] == folders["fig-cql-return", "DCE"] == folders["fig-tau", "expectile 0.7"] == folders["fig-ood", "DCE"]
     assert table["DCE"] == table["DCE one setting"], "the commonest row is this dataset's own"
-    # nine of the ablation, four more critics, DCE's own row, two of SAC, six temperatures, four expectiles, the probe
-    assert table["BC"] == folders["fig-beta", "BC"] and len(set(folders.values())) == 27
+    # nine of the ablation, six more critics, DCE's own row in two units, two of SAC, six temperatures, four expectiles, the
+    # probe
+    assert table["BC"] == folders["fig-beta", "BC"] and len(set(folders.values())) == 30
 
 
 def test_probe_comes_after_the_run_whose_policy_it_needs(tmp_path: Path) -> None:

@@ -15,9 +15,10 @@ from sb3_dce.experiments.claims import own_table_facts
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.figures import panel_curves
 from sb3_dce.experiments.grid import experiment_ids, load_experiment, variant_hash
+from sb3_dce.experiments.judging import HELD, NOT_HELD, UNTESTED, Verdict
 from sb3_dce.experiments.reports import config_table, make_report, toy_table
-from sb3_dce.experiments.tables import TextTable, aggregate_tables, runtime_table, score_table
-from sb3_dce.experiments.verdicts import HELD, NOT_HELD, UNTESTED, Verdict, verdicts
+from sb3_dce.experiments.tables import TextTable, aggregate_tables, common_rows, runtime_table, score_table
+from sb3_dce.experiments.verdicts import verdicts
 from sb3_dce.theory import shift_factor
 
 TABLE, BETA = load_experiment("table1"), load_experiment("fig-beta")
@@ -109,7 +110,7 @@ def test_agent_with_runs_of_another_length_alone_is_shown_with_it_and_compared_w
     assert cell(table, "walker2d-medium-sb3", "ours: PBRL") == "91.0 ± 1.4 (after 10,000)", "not bold, though the best"
     assert cell(table, "walker2d-medium-sb3", "ours: BC") == "**42.0 ± 2.0**"
     assert "PBRL" not in {row[0] for row in aggregate_tables(evidence)["sb3"].rows}
-    assert dict(row[:2] for row in runtime_table(evidence).rows)["PBRL"] == "2.0"
+    assert {row[0]: row[2] for row in runtime_table(evidence).rows}["PBRL"] == "2.0"
     assert (
         evidence_of(results.merge([long, short]), n_updates=50_000).last_of_other_length(
             TABLE.variant("PBRL"), "walker2d-medium-sb3"
@@ -122,7 +123,43 @@ def test_totals_have_the_papers_sum_of_deviations_beside_the_honest_one() -> Non
     rows = table_rows(TABLE, {"walker2d-medium-sb3": scores(), "hopper-medium-sb3": scores()})
     table = aggregate_tables(evidence_of(rows))["sb3"]
     assert cell(table, "CQL", "paper's style of ± (sum of stds)") == "4.0" and cell(table, "CQL", "std of the total") == "2.8"
-    assert cell(table, "CQL", "paper: total of these rows") == "131.0", "72.5 and 58.5"
+    assert cell(table, "CQL", "paper: total of its rows, D4RL") == "131.0", "72.5 and 58.5"
+
+
+def test_totals_are_over_all_data_of_the_papers_agents_and_show_no_run_twice() -> None:
+    own = {"BC": [10.0], "IQL": [30.0], "DCE": [20.0]}
+    rows = table_rows(TABLE, {CHEETAH: own, "hopper-medium-sb3": own})
+    evidence = evidence_of(rows)
+    # on halfcheetah-medium the commonest row is the dataset's own: "one setting" is DCE's run; on Hopper it was not run
+    assert len(evidence.last(TABLE.variant("DCE one setting"), CHEETAH)) == 1
+    assert common_rows(evidence, "sb3") == [CHEETAH, "hopper-medium-sb3"]
+    table = aggregate_tables(evidence)["sb3"]
+    assert [row[0] for row in table.rows] == ["BC", "IQL", "DCE"] and cell(table, "DCE", "total") == "40.0"
+    assert cell(table, "BC", "P(DCE > agent)") == "-", "two runs against two"
+    one = aggregate_tables(evidence_of(table_rows(TABLE, {CHEETAH: own})))["sb3"]
+    assert [row[0] for row in one.rows] == ["BC", "IQL", "DCE"] and one.caption.count("Over the one data set") == 1
+
+
+def test_run_times_of_precisions_stand_in_rows_of_their_own() -> None:
+    parts = [run_rows(TABLE, name, CHEETAH, seed, 40.0, seconds=10.0 + seed) for name in ("DCE", "UWAC") for seed in range(4)]
+    parts[3] = parts[3].assign(device="cpu bf16-matmul")
+    rows = [row[:5] for row in runtime_table(evidence_of(results.merge(parts))).rows]
+    assert rows == [
+        ("UWAC", "cpu, fewer draws", "11.5", "10.0 to 13.0", "4"),
+        ("DCE", "cpu", "11.0", "10.0 to 12.0", "3"),
+        ("DCE", "cpu bf16-matmul", "13.0", "13.0 to 13.0", "1"),
+    ]
+
+
+def test_figure_without_a_line_is_none_though_there_are_runs_of_its_data() -> None:
+    experiment = load_experiment("fig-ood")
+    rows = results.merge(run_rows(experiment, "DCE", CHEETAH, seed, 40.0) for seed in range(3))
+    report = make_report(evidence_of(rows, "fig-ood"))
+    assert not report.has_figure and report.caption == ""
+    curves = {f"probe{b}_{kind}": [1.0] * 10 for b in (0, 1, 2, 4, 8) for kind in ("data", "policy", "max", "min")}
+    probe = run_rows(experiment, "probe", CHEETAH, 0, curves=curves)
+    both = make_report(evidence_of(results.merge([rows, probe]), "fig-ood"))
+    assert both.has_figure and "seeds: 1;" in both.caption, "of the probe, not of DCE"
 
 
 def test_adroit_and_kitchen_have_totals_of_their_own() -> None:
@@ -137,9 +174,13 @@ def test_adroit_and_kitchen_have_totals_of_their_own() -> None:
 
 def test_captions_name_data_hash_length_seeds_and_code() -> None:
     caption = evidence_of(table_rows(TABLE, {CHEETAH: scores()})).caption([CHEETAH])
-    for part in (f"`{CHEETAH}` (made with this package, not D4RL's; sha256 {SHA[:8]}…)", "Gradient steps: 1,000", "seeds: 3"):
+    for part in (
+        f"`{CHEETAH}` (made with this package, not D4RL's; sha256 {SHA[:8]}…; cpu)",
+        "Gradient steps: 1,000",
+        "seeds: 3",
+    ):
         assert part in caption
-    assert "10 episodes" in caption and "0.1.0+0123456789" in caption and "on cpu" in caption
+    assert "10 episodes" in caption and "0.1.0+0123456789" in caption
     d4rl = evidence_of(table_rows(TABLE, {"hopper-medium-v2": scores()})).caption(["hopper-medium-v2"])
     assert "`hopper-medium-v2` (D4RL; sha256" in d4rl
 
@@ -155,25 +196,25 @@ def test_markdown_latex_and_csv_have_the_same_cells() -> None:
 
 
 def beta_rows(factor: float = 1.0, gap: float = 0.01, best: str = "beta 4", wavy: str = "beta 2") -> pd.DataFrame:
-    """Rows in which Q falls by ``factor`` times what theory says, at ten points of 100,000 updates, one beta with a wave."""
-    steps = [10_000 * (i + 1) for i in range(10)]
+    """Rows in which Q falls by ``factor`` times what theory says, at 25 points of 100,000 updates, one beta with a wave."""
+    steps = [4000 * (i + 1) for i in range(25)]
     parts = []
     for variant in BETA.variants:
         unit = 0.0 if "beta" not in variant.set else variant.set["beta"] / (2 * variant.set.get("td_loss_coef", 1.0))
-        lowered = [factor * unit * shift_factor(step - 5000, 0.99, 0.005) for step in steps]
+        lowered = [factor * unit * shift_factor(step - 2000, 0.99, 0.005) for step in steps]
         curves = {
-            "q_data": [400.0 - x + (100.0 if variant.name == wavy and i == 7 else 0.0) for i, x in enumerate(lowered)],
+            "q_data": [400.0 - x + (100.0 if variant.name == wavy and i == 17 else 0.0) for i, x in enumerate(lowered)],
             "value": [399.0 - (x - factor * unit) / 0.99 for x in lowered],
-            "gap_td": [gap * unit] * 10,
+            "gap_td": [gap * unit] * 25,
         }
-        score = {"beta 0": 20.0, "BC": 40.0, "SAC without V": 5.0, "beta 8": 10.0, best: 50.0}.get(variant.name, 45.0)
+        score = {"beta 0": 20.0, "BC": 40.0, "SAC without V": 5.0, "beta 8": 10.0, best: 60.0}.get(variant.name, 45.0)
         parts.append(run_rows(BETA, variant.name, CHEETAH, 0, score, curves, n_updates=100_000))
     return results.merge(parts)
 
 
 def test_claims_on_beta_hold_on_rows_made_by_the_theory() -> None:
-    judged = verdicts(evidence_of(beta_rows(), "fig-beta"))
-    assert len(judged) == 8 and {verdict.outcome for verdict in judged} == {HELD}
+    judged = verdicts(evidence_of(beta_rows(), "fig-beta")) + verdicts(evidence_of(beta_rows(), "bounds"))
+    assert len(judged) == 9 and {verdict.outcome for verdict in judged} == {HELD}
     assert any("beta 2: 1.00, beta 4: 1.00, beta 8: 1.00" in verdict.numbers for verdict in judged)
 
 
@@ -188,7 +229,8 @@ def test_claims_on_beta_hold_on_rows_made_by_the_theory() -> None:
     ],
 )
 def test_claims_on_beta_fail_on_rows_that_break_them(change: dict[str, object], claim: str) -> None:
-    judged = verdicts(evidence_of(beta_rows(**change), "fig-beta"))  # type: ignore[arg-type]
+    rows = beta_rows(**change)  # type: ignore[arg-type]
+    judged = verdicts(evidence_of(rows, "fig-beta")) + verdicts(evidence_of(rows, "bounds"))
     (verdict,) = [v for v in judged if claim in v.claim]
     assert verdict.outcome == NOT_HELD
 
@@ -352,9 +394,12 @@ def test_claim_on_actions_outside_of_the_data_in_the_linear_example() -> None:
 
 def test_facts_of_the_papers_own_table_are_computed() -> None:
     facts = {row[0]: row[2] for row in own_table_facts().rows}
-    assert facts["M1"].endswith("PBRL 805.3, DCE 791.8") and facts["M3"] == "DCE has the top score in 5 of 9 rows"
+    assert "Gym PBRL 805.3, DCE 791.8; Adroit DCE 159.3, IQL 118.1; Kitchen IQL 159.8, DCE 157.8" in facts["M1"]
+    assert facts["M2"].endswith("true for 3 of 4") and "standard errors with 5 seeds 12.6, 16.7" in facts["M9"]
+    assert facts["M3"].startswith("DCE has the top score in 5 of 9 rows; PBRL leads hopper-random")
     assert facts["M4"] == "its rows sum to 157.8" and "DCE: 791.8, printed 791.7" in facts["M5"]
-    assert facts["M9"] == "sum of the row deviations: DCE 73.3; independent rows: 28.1" and len(facts) == 16
+    assert facts["M9"].startswith("sum of the row deviations: DCE 73.3, PBRL 78.6; independent rows: 28.1, 37.3")
+    assert "PBRL's lead of 13.5 is within noise" in facts["M9"] and len(facts) == 16
 
 
 # -- the page ------------------------------------------------------------------------------------------------------

@@ -9,8 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from sb3_dce.experiments.evidence import Evidence
-from sb3_dce.experiments.grid import Variant, variant_hash
+from sb3_dce.experiments.grid import Variant, settings_in_force
 from sb3_dce.experiments.tables import TextTable
+from sb3_dce.schedules import StepSchedule
 
 # A change counts as a cause if it closes this share of the distance to the better of BC and IQL.
 SHARE = 0.5
@@ -41,7 +42,8 @@ def variant_table(evidence: Evidence) -> TextTable:
     header = ("data", *(v.name for v in variants), "finding")
     note = (
         f"Each column after DCE changes one thing of the paper's row. A change is named as a cause if it closes at least "
-        f"{SHARE:.0%} of the distance between DCE and the better of BC and IQL."
+        f"{SHARE:.0%} of the distance between DCE and the better of BC and IQL; one that is none over the length of the runs "
+        "(a constant beta, before the first change of the row's schedule) differs by rounding alone and is not counted."
     )
     return TextTable(header, tuple(rows), f"{evidence.caption([n for _, n in evidence.table_rows()])} {note}")
 
@@ -63,7 +65,7 @@ def diagnostics_table(evidence: Evidence) -> TextTable:
         rows.append((name, *(_number(value) for value in (*cells, half, end))))
     header = (
         *("data", "terminals", "mean reward", "smallest survival margin", "beta_eff", "gap_td", "Q on the data"),
-        *("distance of actions", "alpha", "score at half time", "score at the end"),
+        *("distance of actions", "alpha", "score at 40 to 60 %", "score at the end"),
     )
     note = (
         "Diagnostics of DCE with the paper's row; means over the last tenth of the run where nothing else is said. The "
@@ -93,17 +95,27 @@ def verdict_of(evidence: Evidence, dataset_id: str) -> str:
     if (evidence.start(variant, dataset_id, "data_n_terminals") or 0) > 0 and margin is not None and margin < 0:
         causes.append(f"survival condition broken (margin {margin:.2f})")
     gap = rivals[best] - dce
-    own = variant_hash(variant, dataset_id, evidence.scale)
-    changes = [v for v in experiment.variants if v.algo == variant.algo and variant_hash(v, dataset_id, evidence.scale) != own]
+    changes = [v for v in experiment.variants if v.algo == variant.algo and not _is_same(evidence, v, variant, dataset_id)]
     changed = {v.name: score for v in changes if (score := scores[v.name]) is not None}
     for name, score in changed.items():
         if score - dce >= SHARE * gap:
             causes.append(f"{name} closes {(score - dce) / gap:.0%}")
     half, end = halves(evidence, variant, dataset_id)
     if half is not None and end is not None and end - half >= SHARE * gap:
-        causes.append(f"still rising ({half:.1f} at half time)")
+        causes.append(f"still rising ({half:.1f} in the middle of the run)")
     nothing = "none of the changes explains it" if changed else "no change was run"
     return f"behind {best} by {gap:.1f}: {'; '.join(causes) or nothing}"
+
+
+def _is_same(evidence: Evidence, one: Variant, other: Variant, dataset_id: str) -> bool:
+    """Whether two variants of DCE are the same agent over the length of the runs, whatever their schedules do later."""
+    settings = [settings_in_force(v, dataset_id, evidence.scale) for v in (one, other)]
+    schedules = []
+    for each in settings:
+        every = each.pop("beta_update_every") * each.pop("steps_per_epoch")
+        schedules.append(StepSchedule(each.pop("beta"), each.pop("beta_final"), each.pop("beta_rate"), every))
+    steps = range(0, evidence.n_updates(dataset_id) or 1, min(schedule.every for schedule in schedules))
+    return settings[0] == settings[1] and all(schedules[0].value(n) == schedules[1].value(n) for n in steps)
 
 
 def lowest_margin(evidence: Evidence, variant: Variant, dataset_id: str) -> float | None:
@@ -122,14 +134,12 @@ def halves(evidence: Evidence, variant: Variant, dataset_id: str) -> tuple[float
     :param evidence: rows
     :param variant: agent
     :param dataset_id: data
-    :return: score at half of the run and at its end, each the mean of the evaluations of a tenth of the run before
+    :return: mean score of the evaluations between 40 and 60 % of the run, and in its last tenth
     """
-    curve = evidence.curve(variant, dataset_id, "score")
-    if len(curve) < 2:
-        return None, None
-    middle = curve[curve.index <= (evidence.n_updates(dataset_id) or 0) / 2]
-    n = max(1, len(curve) // 10)
-    means = [None if part.empty else float(part.tail(n).mean().mean()) for part in (middle, curve)]
+    curve, n_updates = evidence.curve(variant, dataset_id, "score"), evidence.n_updates(dataset_id) or 0
+    shares = curve.index / max(1, n_updates)
+    middle, end = curve[(shares >= 0.4) & (shares <= 0.6)], curve[shares > 0.9]
+    means = [None if part.empty else float(part.mean().mean()) for part in (middle, end)]
     return means[0], means[1]
 
 

@@ -104,6 +104,14 @@ class Evidence:
         """
         return self.experiment.datasets[0] if paper is None else self.experiment.dataset(paper)
 
+    def other_kind(self, paper: str | None) -> str:
+        """
+        :param paper: D4RL id; ``None`` for the grid's first
+        :return: how the data that stand for it differ in kind from it; empty if they do not
+        """
+        dataset = self.entry(paper)
+        return (dataset.note or "of another kind") if dataset.other_kind and self.id_of(paper) == dataset.twin else ""
+
     def scope(self, dataset_id: str, variants: Iterable[Variant]) -> str:
         """
         :param dataset_id: data
@@ -265,7 +273,9 @@ class Evidence:
         :param of: "q_data" or "value"
         :return: reference minus variant, one column per common seed; theory's value at the same steps, reward units
         """
-        lowered = self.curve(reference, dataset_id, of) - self.curve(variant, dataset_id, of)
+        curves = [self.curve(v, dataset_id, of) for v in (reference, variant)]
+        # means over intervals of other widths cannot be subtracted
+        lowered = curves[0] - curves[1] if curves[0].index[:1].equals(curves[1].index[:1]) else pd.DataFrame()
         lowered = lowered.dropna(how="all").dropna(axis=1, how="all")
         unit = self.beta_eff(variant, dataset_id)
         steps = np.asarray(lowered.index, dtype=int)
@@ -300,10 +310,11 @@ class Evidence:
             return "No data."
         data = []
         for name in ids:
-            hashes = rows[rows["dataset"] == name]["dataset_sha256"].unique()
-            if len(hashes):
+            of = rows[rows["dataset"] == name]
+            if len(hashes := of["dataset_sha256"].unique()):
                 source = "D4RL" if source_of(name) == "D4RL" else "made with this package, not D4RL's"
-                data.append(f"`{name}` ({source}; sha256 {', '.join(h[:8] for h in hashes)}…)")
+                how = " and ".join(sorted(of["device"].unique()))
+                data.append(f"`{name}` ({source}; sha256 {', '.join(h[:8] for h in hashes)}…; {how})")
         lengths = sorted(rows["n_updates"].unique())
         seeds = rows.drop_duplicates(["dataset", "agent", "config_hash", "seed"])
         counts = sorted(seeds.groupby(["dataset", "agent", "config_hash"], observed=True).size().unique())
@@ -312,7 +323,7 @@ class Evidence:
         text = small if self.scale.source == "embedded" else ""
         text += f"Data: {'; '.join(data)}. Gradient steps: {_listed(lengths)}; seeds: {_listed(counts)}; last policy"
         text += f", {_listed(episodes)} episodes" if episodes else ""
-        text += f". Code {', '.join(sorted(rows['code_version'].unique()))} on {', '.join(sorted(rows['device'].unique()))}."
+        text += f". Code {', '.join(sorted(rows['code_version'].unique()))}."
         changed = {v.name: known for v in shown if (known := self._scale_settings(v))}
         if changed and self.scale.source != "embedded":
             text += " At this scale " + "; ".join(f"{name} has {settings}" for name, settings in changed.items()) + "."

@@ -13,7 +13,7 @@ from sb3_dce.errors import ConfigError
 from sb3_dce.experiments.evidence import UPDATES_PER_EPOCH, Evidence
 from sb3_dce.experiments.grid import Panel, Variant
 from sb3_dce.experiments.statistics import performance_profile
-from sb3_dce.experiments.tables import common_rows
+from sb3_dce.experiments.tables import common_rows, compared
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,7 +46,7 @@ def draw(evidence: Evidence, folder: Path, name: str) -> list[Path]:
     if evidence.scale.source == "embedded":
         first = evidence.experiment.datasets[0].paper
         panels = tuple(p for p in panels if p.dataset in (None, first))
-    columns = 2 if len(panels) == 4 else min(COLUMNS, len(panels))
+    columns = {4: 2, 7: 4, 8: 4}.get(len(panels), min(COLUMNS, len(panels)))
     lines = -(-len(panels) // columns)
     figure = _figure(WIDTH * columns, HEIGHT * lines)
     for number, panel in enumerate(panels):
@@ -68,15 +68,17 @@ def draw_profile(evidence: Evidence, part: str, folder: Path, name: str) -> list
     figure = _figure(1.5 * WIDTH, HEIGHT)
     axes = figure.add_subplot()
     ids = common_rows(evidence, part)
-    scores = {v.name: [evidence.last(v, i) for i in ids] for v in evidence.experiment.variants if v.datasets is None}
-    scores = {agent: tasks for agent, tasks in scores.items() if all(len(task) for task in tasks)}
+    scores = {v.name: [evidence.last(v, i) for i in ids] for v in compared(evidence, ids)}
     every = np.concatenate([task for tasks in scores.values() for task in tasks])
     thresholds = np.linspace(min(0.0, every.min()), max(100.0, every.max()), 201)
     for number, (agent, tasks) in enumerate(scores.items()):
         share = performance_profile(tasks, thresholds)
         axes.step(thresholds, share, color=f"C{number}", linewidth=1.4, label=agent)
     axes.set(xlabel="normalised score", ylabel="share of runs above it", ylim=(-0.02, 1.02))
-    axes.set_title(f"{len(ids)} data sets, {'D4RL' if part.startswith('D4RL') else 'made with this package'}", fontsize=10)
+    axes.set_title(
+        f"{len(ids)} data set{'s' if len(ids) > 1 else ''}, {'D4RL' if part.startswith('D4RL') else 'made with this package'}",
+        fontsize=10,
+    )
     axes.grid(alpha=0.3)
     axes.legend(fontsize=7)
     return _save(figure, folder, name)
@@ -158,8 +160,9 @@ def _line(evidence: Evidence, panel: Panel, variant: Variant, dataset_id: str) -
 
 def _panel(evidence: Evidence, panel: Panel, axes: Axes) -> None:
     curves = panel_curves(evidence, panel)
-    for number, (name, (curve, theory)) in enumerate(curves.items()):
-        color, epochs = f"C{number}", np.asarray(curve.index) / UPDATES_PER_EPOCH
+    colors = _colors(evidence, panel, list(curves))
+    for name, (curve, theory) in curves.items():
+        color, epochs = colors[name], np.asarray(curve.index) / UPDATES_PER_EPOCH
         if curve.shape[1] > 1:
             axes.plot(epochs, curve.to_numpy(), color=color, alpha=0.25, linewidth=0.7)
         label = f"{name} ({curve.shape[1]} seeds)" if curve.shape[1] > 1 else name
@@ -168,19 +171,43 @@ def _panel(evidence: Evidence, panel: Panel, axes: Axes) -> None:
             axes.plot(epochs, theory.to_numpy(), color=color, linestyle="--", linewidth=1.0, label=f"{name}, theory")
     axes.set_xlabel("epoch (1000 gradient steps)")
     axes.set_ylabel(LABELS[panel.metric], fontsize=9)
-    shown = None if panel.over else evidence.id_of(panel.dataset)
-    title = ", ".join(part for part in (shown or panel.dataset, panel.title) if part)
-    axes.set_title(title, fontsize=10)
+    axes.set_title(", ".join(part for part in (_data_title(evidence, panel), panel.title) if part), fontsize=10)
     if panel.metric in ("gap_td", "gap_ref"):
         axes.axhline(0.0, color="0.4", linewidth=0.8)
     if panel.scale != "linear":
         axes.set_yscale(panel.scale)
     axes.grid(alpha=0.3)
     if curves:
-        axes.legend(fontsize=7)
+        for name in _missing(evidence, panel, curves):
+            axes.plot([], [], linestyle="none", label=f"{name}: not run")
+        axes.legend(fontsize=7, framealpha=0.6)
     else:
         axes.set(xticks=[], yticks=[])
         axes.text(0.5, 0.5, _absence(evidence, panel), ha="center", va="center", transform=axes.transAxes, color="0.4")
+
+
+def _colors(evidence: Evidence, panel: Panel, lines: list[str]) -> dict[str, str]:
+    """A variant has one colour in all panels."""
+    order = lines if panel.over or panel.lines else [v.name for v in evidence.experiment.variants]
+    return {name: f"C{order.index(name) % 10}" for name in lines}
+
+
+def _data_title(evidence: Evidence, panel: Panel) -> str | None:
+    """Id of the data shown; without runs that of those the scale would take."""
+    if panel.over:
+        return None
+    entry = evidence.entry(panel.dataset)
+    planned = entry.twin if evidence.scale.source == "twin" and entry.twin else entry.paper
+    return evidence.id_of(panel.dataset) or planned
+
+
+def _missing(evidence: Evidence, panel: Panel, curves: dict[str, tuple[pd.DataFrame, pd.Series | None]]) -> list[str]:
+    """Lines that belong to a panel and have no runs."""
+    if panel.over:
+        return [name for name in panel.over if evidence.id_of(name) not in curves]
+    if panel.lines:
+        return []
+    return [name for name in panel.variants or tuple(v.name for v in evidence.experiment.variants) if name not in curves]
 
 
 def _absence(evidence: Evidence, panel: Panel) -> str:

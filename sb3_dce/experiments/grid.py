@@ -281,8 +281,17 @@ def variant_hash(variant: Variant, dataset_id: str, scale: Scale | None = None) 
     :param scale: adds its own arguments
     :return: hash of the run's configuration, as it stands in the rows
     """
-    row = row_of(variant.algo, dataset_id)
-    return config_hash(variant.algo, {**defaults_of(variant.algo), **row, **_overrides(variant, scale)})
+    return config_hash(variant.algo, settings_in_force(variant, dataset_id, scale))
+
+
+def settings_in_force(variant: Variant, dataset_id: str, scale: Scale | None = None) -> dict[str, Any]:
+    """
+    :param variant: of a grid
+    :param dataset_id: data it is run on
+    :param scale: adds its own arguments
+    :return: every argument of the agent's constructor
+    """
+    return {**defaults_of(variant.algo), **row_of(variant.algo, dataset_id), **_overrides(variant, scale)}
 
 
 def source_of(dataset_id: str) -> str:

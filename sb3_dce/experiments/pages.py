@@ -8,9 +8,9 @@ from pathlib import Path
 
 from sb3_dce.experiments.claims import claim_table, own_table_facts
 from sb3_dce.experiments.evidence import Evidence
+from sb3_dce.experiments.judging import Verdict
 from sb3_dce.experiments.reports import Report, count
 from sb3_dce.experiments.tables import TextTable, parts_of
-from sb3_dce.experiments.verdicts import Verdict
 from sb3_dce.files import write_atomically
 
 HEADINGS = {

@@ -10,11 +10,13 @@ from sb3_dce.dce import OfflineDCE
 from sb3_dce.experiments import diagnosis, tables
 from sb3_dce.experiments.configuration import row_of
 from sb3_dce.experiments.evidence import Evidence
-from sb3_dce.experiments.grid import source_of
+from sb3_dce.experiments.figures import panel_curves
+from sb3_dce.experiments.grid import Variant, source_of
+from sb3_dce.experiments.judging import CLOSE, HELD, NOT_HELD, UNTESTED, Verdict, judge
 from sb3_dce.experiments.paper import paper_score, read_csv
 from sb3_dce.experiments.statistics import bootstrap_interval
 from sb3_dce.experiments.tables import TextTable
-from sb3_dce.experiments.verdicts import HELD, UNTESTED, Verdict, judge, verdicts
+from sb3_dce.experiments.verdicts import verdicts
 from sb3_dce.schedules import StepSchedule
 from sb3_dce.theory import penalty_bound, sampling_bound, upper_bound
 
@@ -52,8 +54,8 @@ def make_report(evidence: Evidence) -> Report:
     :return: its report; where there are no rows, tables and figure say so
     """
     kind = evidence.experiment.report
-    shown = [name for _, name in evidence.table_rows()]
-    caption = evidence.caption(shown) if kind in ("figure", "bounds") else ""
+    drawn = drawn_in(evidence)
+    caption = evidence.caption(*drawn) if drawn is not None else ""
     found: dict[str, TextTable] = {}
     judged = verdicts(evidence)
     if kind == "table":
@@ -72,7 +74,32 @@ def make_report(evidence: Evidence) -> Report:
     elif kind == "configuration":
         found = {"rows": config_table(), "common": common_table()}
         judged = [_config_verdict(found["rows"])]
-    return Report(found, bool(evidence.experiment.panels and shown), caption, judged)
+    return Report(found, drawn is not None, caption, judged)
+
+
+def drawn_in(evidence: Evidence) -> tuple[list[str], list[Variant]] | None:
+    """
+    :param evidence: rows of one experiment
+    :return: data and variants of which there is a line in any panel, ``None`` if all panels are empty
+    """
+    experiment = evidence.experiment
+    ids: set[str] = set()
+    names: set[str] = set()
+    for panel in experiment.panels:
+        curves = panel_curves(evidence, panel)
+        shown = panel.variants or tuple(v.name for v in experiment.variants)
+        if panel.over:
+            ids.update(curves)
+        elif curves:
+            ids.update(name for name in [evidence.id_of(panel.dataset)] if name is not None)
+        if curves:
+            # lines of one variant (over data sets, or critics of the probe) have names of their own
+            names.update(shown[:1] if panel.over or panel.lines else curves)
+            names.update([panel.reference] if panel.reference else [])
+    if not ids:
+        return None
+    order = [name for _, name in evidence.table_rows() if name in ids]
+    return order, [v for v in experiment.variants if v.name in names]
 
 
 def reproduction(evidence: Evidence) -> Verdict:
@@ -203,7 +230,7 @@ def _config_verdict(table: TextTable) -> Verdict:
 def count(judged: list[Verdict]) -> str:
     """
     :param judged: verdicts
-    :return: how many held, did not hold, could not be tested
+    :return: how many have each outcome
     """
-    held, untested = (sum(v.outcome == outcome for v in judged) for outcome in (HELD, UNTESTED))
-    return f"{held} held, {len(judged) - held - untested} did not hold, {untested} could not be tested"
+    numbers = {outcome: sum(v.outcome == outcome for v in judged) for outcome in (HELD, NOT_HELD, CLOSE, UNTESTED)}
+    return ", ".join(f"{n} {outcome}" for outcome, n in numbers.items())

@@ -51,8 +51,9 @@ PLAN_KEY = ["dataset", "agent", "config_hash", "n_updates", "seed"]
 # Diagnostics that figures, verdicts and the search for causes read, by their names in the log.
 CURVES = ("q_data", "q_policy", "value", "gap_td", "ent_coef", "beta_eff", "survival_margin", "action_dist", "entropy", "adv")
 PROBE_CURVE = re.compile(r"probe\d+_(data|policy|init|best|max|min)")
-# A curve of diagnostics has at most this many points, each the mean since the last.
-POINTS = 100
+# A curve of diagnostics has at most POINTS points, each the mean since the last; a short run has wider gaps than FINEST steps
+# only for FEWEST_POINTS.
+POINTS, FEWEST_POINTS, FINEST = 100, 25, 2000
 # Episodes of the paper's evaluation: four in its Gym table, five in the text for the others.
 PAPER_EPISODES = {"gym": 4, "adroit": 5, "kitchen": 5}
 
@@ -88,7 +89,7 @@ def rows_of_run(folder: Path, experiment: str) -> pd.DataFrame | None:
             "code_version": config["versions"]["sb3_dce"] + (f"+{commit}" if commit else ""),
             "device": _device(config),
         }
-        values = [*_facts(folder, config, result, divergence, n_updates), *_curves(folder, n_updates, run["eval_freq"])]
+        values = [*_facts(folder, config, result, divergence, n_updates), *_curves(folder, n_updates)]
         values += _evaluations(folder, dataset_id, n_updates)
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(
@@ -300,13 +301,13 @@ def _evaluations(folder: Path, dataset_id: str | None, n_updates: int) -> list[t
     return values
 
 
-def _curves(folder: Path, n_updates: int, eval_freq: int) -> list[tuple[int, str, float]]:
-    """Diagnostics of the log, averaged over intervals of at least ``eval_freq`` steps."""
+def _curves(folder: Path, n_updates: int) -> list[tuple[int, str, float]]:
+    """Diagnostics of the log, averaged over intervals that depend on the length of the run alone."""
     log = read_log(folder)
     log = log[log.index <= n_updates]  # a complete run may be on its way to become a longer one
     if log.empty:
         return []
-    width = max(eval_freq, -(-n_updates // POINTS))
+    width = max(-(-n_updates // POINTS), min(FINEST, -(-n_updates // FEWEST_POINTS)))
     columns = [str(name).removeprefix("train/") for name in log if str(name).startswith("train/")]
     names = [name for name in columns if name in CURVES or PROBE_CURVE.fullmatch(name)]
     ends = (-(-log.index.to_numpy(dtype=int) // width) * width).clip(max=n_updates)

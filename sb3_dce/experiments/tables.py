@@ -14,7 +14,7 @@ import pandas as pd
 
 from sb3_dce.data.catalog import resolve
 from sb3_dce.experiments.evidence import Evidence, at_end, curve_of
-from sb3_dce.experiments.grid import Variant, source_of
+from sb3_dce.experiments.grid import Variant, source_of, variant_hash
 from sb3_dce.experiments.paper import paper_score, paper_scores
 from sb3_dce.experiments.statistics import (
     N_RESAMPLES,
@@ -32,6 +32,10 @@ BOLD_RULE = (
     "Bold: the 95 % bootstrap interval over seeds overlaps that of the best mean of the row (with one seed: the best mean). "
     "± is the sample standard deviation over seeds. 'After n' are runs of another length than those of the row."
 )
+
+# A probability from fewer comparisons of single runs says nothing.
+FEWEST_PAIRS = 5
+MIXED_PROTOCOLS = "The paper's baselines are copied from other papers, with other protocols."
 
 
 @dataclass(frozen=True)
@@ -115,9 +119,9 @@ def score_table(evidence: Evidence) -> TextTable:
     ids = [name for _, name in evidence.table_rows()]
     tuned = (
         "DCE has the paper's row of each dataset; the paper tuned these by evaluating online. 'One setting' has its commonest "
-        "row everywhere. The paper's baselines are copied from other papers, with other protocols."
+        "row everywhere."
     )
-    return TextTable(header, tuple(rows), f"{evidence.caption(ids)} {BOLD_RULE} {tuned}")
+    return TextTable(header, tuple(rows), f"{evidence.caption(ids)} {BOLD_RULE} {tuned} {MIXED_PROTOCOLS}")
 
 
 def score_cell(evidence: Evidence, variant: Variant, dataset_id: str, best: tuple[float, Interval] | None) -> str:
@@ -177,17 +181,37 @@ def common_rows(evidence: Evidence, part: str) -> list[str]:
     """
     :param evidence: rows
     :param part: one of :func:`parts_of`
-    :return: data of this part on which every agent that has runs in it has a score
+    :return: data of this part on which every agent of the paper that has runs in it has a score
     """
     ids = _rows_of_part(evidence, part)
-    variants = [v for v in evidence.experiment.variants if v.datasets is None and _has_any(evidence, v, ids)]
+    variants = [v for v in evidence.experiment.variants if v.paper is not None and _has_any(evidence, v, ids)]
     return [name for name in ids if all(len(evidence.last(v, name)) for v in variants)]
+
+
+def compared(evidence: Evidence, ids: list[str]) -> list[Variant]:
+    """
+    :param evidence: rows
+    :param ids: data
+    :return: columns with a score on all of them that are not DCE once more ("one setting" where it is the row's everywhere)
+    """
+    hashes: list[list[str]] = []
+    found = []
+    for variant in evidence.experiment.variants:
+        runs = [variant_hash(variant, name, evidence.scale) for name in ids]
+        if variant.datasets is None and runs not in hashes and all(len(evidence.last(variant, name)) for name in ids):
+            hashes.append(runs)
+            found.append(variant)
+    return found
 
 
 def _rows_of_part(evidence: Evidence, part: str) -> list[str]:
     source, _, family = part.partition("-")
     rows = [name for _, name in evidence.table_rows() if source_of(name) == source]
     return [name for name in rows if not family or resolve(name).family == family]
+
+
+def _counted(n: int) -> str:
+    return "the one data set" if n == 1 else f"the {n} data sets"
 
 
 def _has_any(evidence: Evidence, variant: Variant, ids: list[str]) -> bool:
@@ -208,12 +232,12 @@ def aggregate_tables(evidence: Evidence) -> dict[str, TextTable]:
 
 
 def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
-    variants = [v for v in evidence.experiment.variants if v.datasets is None and _has_any(evidence, v, ids)]
+    variants = compared(evidence, ids)
     dce = next((v for v in variants if v.name == "DCE"), None)
     paper_rows = [evidence.paper_id(dataset) for dataset, name in evidence.table_rows() if name in ids]
     header = (
         *("agent", "total", "paper's style of ± (sum of stds)", "std of the total"),
-        *("mean", "IQM", "95 % interval of the IQM", "P(DCE > agent)", "runs", "paper: total of these rows"),
+        *("mean", "IQM", "95 % interval of the IQM", "P(DCE > agent)", "runs", "paper: total of its rows, D4RL"),
     )
     rows = []
     for variant in variants:
@@ -223,7 +247,8 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
         spreads = ("-", "-") if np.isnan(stds).any() else (f"{sums.paper_std:.1f}", f"{sums.std:.1f}")
         low, high = bootstrap_interval(scores, iqm)
         chance = "-"
-        if dce is not None and variant is not dce:
+        n_pairs = sum(len(evidence.last(dce, name)) * len(task) for name, task in zip(ids, scores, strict=True)) if dce else 0
+        if dce is not None and variant is not dce and n_pairs >= FEWEST_PAIRS:
             chance = f"{probability_of_improvement([evidence.last(dce, name) for name in ids], scores):.2f}"
         printed = [None if variant.paper is None else paper_score(name, variant.paper) for name in paper_rows]
         known = [cell.score for cell in printed if cell is not None and cell.score is not None]
@@ -238,9 +263,9 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
             )
         )
     note = (
-        f"Over the {len(ids)} data sets on which all of these agents have runs of one length. The interval is a stratified "
-        f"bootstrap over seeds within data sets ({N_RESAMPLES:,} resamples; none with one seed); the deviation of the total "
-        "takes the rows as independent."
+        f"Over {_counted(len(ids))} on which all agents of the paper that were run have runs of one length. The interval is a "
+        f"stratified bootstrap over seeds within data sets ({N_RESAMPLES:,} resamples; none with one seed); the deviation of "
+        f"the total takes the rows as independent. {MIXED_PROTOCOLS}"
     )
     return TextTable(header, tuple(rows), f"{evidence.caption(ids, variants)} {note}")
 
@@ -248,39 +273,37 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
 def runtime_table(evidence: Evidence) -> TextTable:
     """
     :param evidence: of an experiment with a table
-    :return: seconds per 1000 updates beside the paper's
+    :return: seconds per 1000 updates beside the paper's, one row per agent, device and precision
     """
     rows = []
     ids = [name for _, name in evidence.table_rows()]
     for variant in evidence.experiment.variants:
-        rates = seconds_per_1000(evidence, variant, ids)
-        cell = None if variant.paper is None else paper_scores().get(("gym", "runtime-s", variant.paper))
+        if variant.paper is None:  # DCE again, with other numbers
+            continue
+        cell = paper_scores().get(("gym", "runtime-s", variant.paper))
         printed = "-" if cell is None or cell.score is None else f"{cell.score:g}"
-        if len(rates):
-            rows.append((variant.name, f"{np.median(rates):.1f}", f"{rates.min():.1f} to {rates.max():.1f}", printed))
-    note = "Wall time with evaluations, of runs beside others: an order; benchmarks/results/speed.md measures."
-    header = ("agent", "s per 1000 updates (median)", "range", "paper: s per 1000, RTX 3070")
+        runs = run_times(evidence, variant, ids)
+        for device in sorted({run.device for run in runs}, key=lambda device: (" " in device, device)):
+            rates = np.array([run.seconds for run in runs if run.device == device])
+            spread = f"{rates.min():.1f} to {rates.max():.1f}"
+            settings = "fewer draws" if has_fewer_draws(evidence, variant) else ""
+            how = ", ".join(part for part in (device, settings) if part)
+            rows.append((variant.name, how, f"{np.median(rates):.1f}", spread, str(len(rates)), printed))
+    note = (
+        "Wall time with evaluations, of runs beside others: an order; benchmarks/results/speed.md measures. Rounded products "
+        f"(bf16-matmul) and fewer draws make an agent faster than the paper's. {MIXED_PROTOCOLS}"
+    )
+    header = ("agent", "device and precision", "s per 1000 updates (median)", "range", "runs", "paper: s per 1000, RTX 3070")
     return TextTable(header, tuple(rows), f"{evidence.caption(ids)} {note}")
 
 
-def seconds_per_1000(evidence: Evidence, variant: Variant, dataset_ids: list[str]) -> np.ndarray:
+def has_fewer_draws(evidence: Evidence, variant: Variant) -> bool:
     """
-    :param evidence: rows
+    :param evidence: rows at a scale
     :param variant: agent
-    :param dataset_ids: data
-    :return: of each complete run that was trained alone; members of a population have its time together
+    :return: whether the scale makes each of its updates cheaper than the authors'
     """
-    rates = []
-    for name in dataset_ids:
-        alone = _timed_alone(evidence, variant, name)
-        rates.append(1000.0 * alone["value"].to_numpy(dtype=float) / alone["n_updates"].to_numpy(dtype=float))
-    return np.concatenate(rates) if rates else np.empty(0)
-
-
-def _timed_alone(evidence: Evidence, variant: Variant, dataset_id: str) -> pd.DataFrame:
-    """Seconds of each complete run, whatever its length, that was no member of a population."""
-    rows = pd.concat([evidence.runs(variant, dataset_id), evidence.of_other_length(variant, dataset_id)])
-    return rows[(rows["metric"] == "seconds") & ~rows["device"].str.contains("population")]
+    return "n_mc_dropout" in evidence.scale.set_for.get(variant.algo, {})
 
 
 class RunTime(NamedTuple):
@@ -302,19 +325,30 @@ class RunTime(NamedTuple):
         return f"{self.seconds:.1f} s ({self.device}{', fewer draws' if self.hastened and ' ' not in self.device else ''})"
 
 
+def run_times(evidence: Evidence, variant: Variant, dataset_ids: list[str]) -> list[RunTime]:
+    """
+    :param evidence: rows
+    :param variant: agent
+    :param dataset_ids: data
+    :return: of each complete run, whatever its length, that was trained alone: members of a population have its time together
+    """
+    fewer, runs = has_fewer_draws(evidence, variant), []
+    for name in dataset_ids:
+        rows = pd.concat([evidence.runs(variant, name), evidence.of_other_length(variant, name)])
+        alone = rows[(rows["metric"] == "seconds") & ~rows["device"].str.contains("population")]
+        for value, n_updates, device in zip(alone["value"], alone["n_updates"], alone["device"], strict=True):
+            runs.append(RunTime(1000.0 * value / n_updates, device, fewer or " " in device))
+    return runs
+
+
 def fastest_run(evidence: Evidence, variant: Variant, dataset_ids: list[str]) -> RunTime | None:
     """
     :param evidence: of an experiment with a table
     :param variant: agent
     :param dataset_ids: data
-    :return: the run that others disturbed least, of those that were trained alone in float32 if there are any
+    :return: the run that others disturbed least, of those in float32 if there are any
     """
-    reduced = "n_mc_dropout" in evidence.scale.set_for.get(variant.algo, {})
-    runs = []
-    for name in dataset_ids:
-        alone = _timed_alone(evidence, variant, name)
-        for value, n_updates, device in zip(alone["value"], alone["n_updates"], alone["device"], strict=True):
-            runs.append(RunTime(1000.0 * value / n_updates, device, reduced or " " in device))
+    runs = run_times(evidence, variant, dataset_ids)
     return min(runs, key=lambda run: (" " in run.device, run.seconds), default=None)
 
 
@@ -342,7 +376,8 @@ def long_table(evidence: Evidence) -> TextTable:
                 few = at_end(runs, "score_paper_episodes")
                 curve = curve_of(runs, "score")
                 paper_mode = float(few.mean()) if len(few) else float("nan")
-                late = (float(curve.tail(10).mean().mean()), float(curve.max().mean()))
+                last_ten = float(curve.tail(10).mean().mean()) if len(curve) > 10 else float("nan")
+                late = (last_ten, float(curve.max().mean()))
                 values = (float(scores.mean()), sample_std(scores), low, high, paper_mode, *late)
                 numbers = ["" if np.isnan(v) else f"{v:.4f}" for v in values] + [" ".join(f"{s:.4f}" for s in scores)]
             paper = evidence.paper_id(dataset)

@@ -1,0 +1,226 @@
+"""
+From numbers to outcomes: what a claim is tested with, and when two scores are too close for one or few seeds to tell.
+
+"held" and "did not hold" are about these data and these lengths, no more; "could not be tested" is for missing runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_dce.experiments.evidence import Evidence
+from sb3_dce.experiments.grid import Variant
+from sb3_dce.experiments.statistics import sample_std
+
+HELD, NOT_HELD, CLOSE, UNTESTED = "held", "did not hold", "too close to tell", "could not be tested"
+
+TENTH = "means over the last tenth of the run"
+# Standard deviation of the score over seeds where there are fewer than three: DCE after 50,000 steps on
+# halfcheetah-medium-sb3, five seeds (docs/results/halfcheetah-medium-sb3.md).
+SEED_STD = 4.2
+CLEARLY = (
+    f"clearly: by more than two standard errors over seeds, with a standard deviation of {SEED_STD:g} (measured for DCE) "
+    "where there are fewer than three seeds"
+)
+
+
+class Verdict(NamedTuple):
+    """
+    :param claim: of the paper
+    :param rule: when it counts as borne out
+    :param outcome: "held", "did not hold", "too close to tell" or "could not be tested"
+    :param numbers: what the rule was applied to
+    """
+
+    claim: str
+    rule: str
+    outcome: str
+    numbers: str
+
+
+def judge(claim: str, rule: str, holds: bool | str | None, numbers: str) -> Verdict:
+    """
+    :param claim: of the paper
+    :param rule: applied
+    :param holds: outcome, ``CLOSE``, or ``None`` without the runs it needs
+    :param numbers: shown
+    :return: verdict
+    """
+    if isinstance(holds, str):
+        return Verdict(claim, rule, holds, numbers)
+    outcome = UNTESTED if holds is None else HELD if holds else NOT_HELD
+    return Verdict(claim, rule, outcome, numbers if holds is not None else numbers or "runs are missing")
+
+
+class Values(dict[str, float]):
+    """
+    Numbers by variant.
+
+    :ivar scope: data, length and seeds they rest on
+    :ivar other_kind: how the data differ in kind from those that the paper's claim is about; empty if they do not
+    :ivar errors: standard error over seeds of each, for scores
+    """
+
+    scope = ""
+    other_kind = ""
+
+    def __init__(self, values: Iterable[tuple[str, float]] = ()) -> None:
+        super().__init__(values)
+        self.errors: dict[str, float] = {}
+
+    def text(self, digits: int = 1) -> str:
+        """
+        :param digits: behind the point
+        :return: names, numbers and scope; empty without numbers
+        """
+        numbers = ", ".join(f"{name}: {value:.{digits}f}" for name, value in self.items())
+        return f"{numbers} ({self.scope})" if numbers and self.scope else numbers
+
+
+def values_of(evidence: Evidence, names: list[str], metric: str, dataset: str | None = None) -> Values | None:
+    """
+    :param evidence: rows
+    :param names: of variants
+    :param metric: name
+    :param dataset: D4RL id; ``None`` for the grid's first
+    :return: value of each variant at the end of its runs: mean of the last tenth, over seeds; ``None`` if one is missing
+    """
+    dataset_id = evidence.id_of(dataset)
+    if dataset_id is None:
+        return None
+    values = Values()
+    variants = [evidence.experiment.variant(name) for name in names]
+    for variant in variants:
+        value = evidence.tail(variant, dataset_id, metric)
+        if value is None:
+            return None
+        values[variant.name] = value
+        values.errors[variant.name] = standard_error(evidence.last(variant, dataset_id))
+    values.scope = evidence.scope(dataset_id, variants)
+    values.other_kind = evidence.other_kind(dataset)
+    return values
+
+
+def standard_error(scores: np.ndarray) -> float:
+    """
+    :param scores: of one agent, one per seed
+    :return: standard error of their mean, with ``SEED_STD`` where fewer than three seeds say little on it
+    """
+    n = max(1, len(scores))
+    return (sample_std(scores) if n > 2 else SEED_STD) / float(np.sqrt(n))
+
+
+def above(values: Values | None, first: str, second: str) -> bool | str | None:
+    """
+    :param values: scores
+    :param first: name
+    :param second: name
+    :return: whether the first is above the second, ``CLOSE`` if seeds alone could have made the difference
+    """
+    if values is None:
+        return None
+    return differs(values[first] - values[second], values.errors[first], values.errors[second])
+
+
+def differs(difference: float, one: float, other: float) -> bool | str:
+    """
+    :param difference: of two scores
+    :param one: standard error of the first
+    :param other: standard error of the second
+    :return: whether it is positive, ``CLOSE`` within two standard errors
+    """
+    return CLOSE if abs(difference) <= 2.0 * float(np.hypot(one, other)) else difference > 0
+
+
+def all_of(parts: Iterable[bool | str | None]) -> bool | str | None:
+    """
+    :param parts: outcomes
+    :return: true if all are, false if one is, else the open one
+    """
+    found = list(parts)
+    if any(part is False for part in found):
+        return False
+    if any(part is None for part in found):
+        return None
+    return CLOSE if CLOSE in found else True
+
+
+def text_of(*parts: Values | None) -> str:
+    """
+    :param parts: numbers, those that are there
+    :return: their texts
+    """
+    return ", ".join(text for part in parts if part is not None and (text := part.text()))
+
+
+def falling(values: Values | None) -> bool | None:
+    """
+    :param values: in the order of the claim
+    :return: whether each is below the one before
+    """
+    return None if values is None else bool(np.all(np.diff(list(values.values())) < 0))
+
+
+def rising(values: Values | None) -> bool | None:
+    """
+    :param values: in the order of the claim
+    :return: whether each is above the one before
+    """
+    return None if values is None else bool(np.all(np.diff(list(values.values())) > 0))
+
+
+def scoped(evidence: Evidence, names: list[str] | None = None) -> Values:
+    """
+    :param evidence: rows
+    :param names: of variants; ``None`` for all
+    :return: no numbers yet, of the grid's first data
+    """
+    values, dataset_id = Values(), evidence.id_of(None)
+    if dataset_id is not None:
+        variants = evidence.experiment.variants
+        values.scope = evidence.scope(dataset_id, [v for v in variants if names is None or v.name in names])
+    return values
+
+
+def lengths_and_seeds(evidence: Evidence, variant: Variant, dataset_ids: Iterable[str]) -> str:
+    """
+    :param evidence: rows
+    :param variant: agent
+    :param dataset_ids: data, each of which has its number under its name
+    :return: scope of a statement over several data sets
+    """
+    scopes = [evidence.scope(name, [variant]).removeprefix(f"{name}, ") for name in dataset_ids]
+    return "; ".join(dict.fromkeys(scopes))
+
+
+def on_this_kind(claim: str, rule: str, holds: bool | str | None, values: Values | None, digits: int = 1) -> Verdict:
+    """
+    What is claimed of a kind of data is not tested on another.
+
+    :param claim: of the paper
+    :param rule: applied
+    :param holds: outcome if the data are of this kind
+    :param values: numbers
+    :param digits: behind the point
+    :return: verdict
+    """
+    text = "" if values is None else values.text(digits)
+    if values is None or not values.other_kind:
+        return judge(claim, rule, holds, text)
+    return judge(claim, rule, None, f"{values.other_kind}: {text}")
+
+
+def all_diverged(evidence: Evidence, name: str) -> bool:
+    """
+    :param evidence: rows
+    :param name: of a variant
+    :return: whether every run of it on the grid's first data was lost
+    """
+    dataset_id, variant = evidence.id_of(None), evidence.experiment.variant(name)
+    if dataset_id is None:
+        return False
+    n_runs = evidence.runs(variant, dataset_id)["seed"].nunique()
+    return 0 < n_runs == evidence.n_diverged(variant, dataset_id)
