@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
+import math
 import os
+import pathlib
 import warnings
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -18,12 +21,13 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_dce import hyperparams
 from sb3_dce.buffers import OfflineReplayBuffer
-from sb3_dce.data import Transitions, find_file, load_transitions
+from sb3_dce.checks import missing_vec_normalize
+from sb3_dce.data import Transitions, find_file, load_dataset, load_transitions
 from sb3_dce.data.catalog import DatasetSpec, resolve
 from sb3_dce.data.locate import is_path
 from sb3_dce.data.minari import is_minari_name
 from sb3_dce.envs import SpacesEnv, dataset_spaces, make_env_if_possible, make_minari_env
-from sb3_dce.errors import ConfigError, DatasetSemanticsError, DatasetWarning
+from sb3_dce.errors import ConfigError, DatasetIntegrityError, DatasetSemanticsError, DatasetWarning
 from sb3_dce.networks import StandardizedExtractor
 
 DatasetLike = str | os.PathLike[str] | Transitions
@@ -43,6 +47,8 @@ class AttachingMixin(OffPolicyAlgorithm):
     # Filled at attach, saved with the model: what diagnostics and reward scaling need to know of the data.
     dataset_statistics: dict[str, Any] | None
     _transitions: Transitions | None
+    # Saved: without the statistics of its VecNormalize a model is not what was trained.
+    trained_with_vec_normalize: bool = False
 
     @classmethod
     def load_dataset(
@@ -57,7 +63,8 @@ class AttachingMixin(OffPolicyAlgorithm):
 
         ``OfflineDCE.load_dataset("walker2d-medium").learn(1e6)`` is the shortest way to a trained agent.
 
-        :param name: catalogue id, embedded id, ``minari:`` and an id of Minari, path of a file, or ``Transitions``
+        :param name: catalogue id, embedded id, ``minari:`` and an id of Minari, path of a file, ``Transitions``, or what
+            :func:`sb3_dce.load_dataset` makes these of (a data frame, arrays, a replay buffer of Stable-Baselines3)
         :param env: environment for evaluation; ``None`` makes the dataset's own if its simulator is installed
         :param policy: policy name or class; ``None`` takes that of the row
         :param overrides: constructor arguments that replace those of the row
@@ -68,8 +75,9 @@ class AttachingMixin(OffPolicyAlgorithm):
         if "dataset" in overrides:
             hint = "Give it once, as the first argument; other data of a model: model.set_dataset(...)."
             raise ConfigError(f"two datasets are given: {name!r} and {overrides['dataset']!r}", key="dataset", hint=hint)
+        name = as_dataset(name)
         spec = None if isinstance(name, Transitions) else find_file(name)[1]
-        row = hyperparams.load_row(cls.algo_name, None if spec is None else spec.id)
+        row = hyperparams.load_row(_algo_with_rows(cls), None if spec is None else spec.id)
         arguments = {**hyperparams.split_row(row).kwargs, **overrides}
         hyperparams.check_keys(cls, overrides, where=f"{cls.__name__}.load_dataset")
         hyperparams.check_keys(cls, arguments, where=f"zoo_hyperparams/{cls.algo_name}.yml")
@@ -85,17 +93,40 @@ class AttachingMixin(OffPolicyAlgorithm):
         """
         Train on other data from the next ``learn()`` on.
 
-        :param dataset: catalogue id, ``minari:`` id, path of a file, or ``Transitions``
+        :param dataset: as for :meth:`load_dataset`
         """
         self._remember_dataset(dataset)
-        assert isinstance(self.replay_buffer, OfflineReplayBuffer)
-        self.replay_buffer.reset()
+        self._own_buffer().reset()
+        self.dataset_statistics = None
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        Train on the rows of a saved buffer: one of this package, or one that another algorithm of Stable-Baselines3 filled.
+
+        :param path: file that ``save_replay_buffer`` wrote. It is a pickle: open only files you trust
+        :param truncate_last_traj: kept for Stable-Baselines3
+        """
+        super().load_replay_buffer(path, truncate_last_traj)
+        if not isinstance(self.replay_buffer, OfflineReplayBuffer):
+            transitions = Transitions.from_replay_buffer(self.replay_buffer)
+            self.replay_buffer = OfflineReplayBuffer(1, self.observation_space, self.action_space, self.device)
+            self.set_dataset(transitions)
+
+    def _own_buffer(self) -> OfflineReplayBuffer:
+        if not isinstance(self.replay_buffer, OfflineReplayBuffer):
+            raise ConfigError(
+                f"the model's replay buffer is a {type(self.replay_buffer).__name__}, not one of this package",
+                key="replay_buffer",
+                hint="Give other buffers to model.set_dataset(sb3_dce.load_dataset(<buffer>)).",
+            )
+        return self.replay_buffer
 
     def _remember_dataset(self, dataset: DatasetLike | None) -> DatasetSpec | None:
         """Keep the id or path (saved), and the data themselves if they were given as an object (never saved)."""
         self._transitions, self.dataset = None, None
         if dataset is None:
             return None
+        dataset = as_dataset(dataset)
         if isinstance(dataset, Transitions):
             self._transitions = dataset
             if self.d4rl_compat and not dataset.info.d4rl_compat:
@@ -143,30 +174,46 @@ class AttachingMixin(OffPolicyAlgorithm):
                 raise ConfigError(
                     "there is nothing to learn from: the model has no dataset",
                     key="dataset",
-                    hint="Pass dataset=<id or file> to the constructor, or call model.set_dataset(<id or file>).",
+                    hint="Pass dataset=<id or file> to the constructor (in a YAML row: dataset: '<id>'), or call "
+                    "model.set_dataset(<id or file>).",
                 )
             options: dict[str, Any] = {}
             if hasattr(self, "action_space"):  # not yet while the spaces themselves are read from the data
                 space = self.action_space
                 assert isinstance(space, spaces.Box)
+                self._refuse_other_width(space)
                 options = {"action_low": space.low.reshape(-1), "action_high": space.high.reshape(-1)}
             self._transitions = load_transitions(self.dataset, d4rl_compat=self.d4rl_compat, **options)
         return self._transitions
+
+    def _refuse_other_width(self, space: spaces.Box) -> None:
+        """What the catalogue knows of the data is said before they are read with bounds that cannot fit."""
+        spec = None if self.dataset is None or is_minari_name(self.dataset) else find_file(self.dataset)[1]
+        if spec is not None and spec.act_dim != int(np.prod(space.shape)):
+            raise ConfigError(
+                f"the dataset {spec.id} has actions of width {spec.act_dim}, the model's environment of {space.shape[0]}",
+                key="env",
+                hint="Use the environment the data were recorded in, or none.",
+            )
 
     def attach_dataset(self) -> None:
         """
         Read the dataset into the replay buffer, if that has not been done.
 
         :raises ConfigError: if the model has no dataset
-        :raises DatasetError: if the data cannot be read or do not fit the model
+        :raises DatasetError: if the data cannot be read or do not fit the model, or are not those a loaded model learned from
         """
-        buffer = self.replay_buffer
-        assert isinstance(buffer, OfflineReplayBuffer)
+        buffer = self._own_buffer()
         if buffer.size() > 0:
             if self.dataset_statistics is None:  # filled by load_replay_buffer() or add()
                 self._take_statistics_of(buffer)
+                if self.dataset is not None and buffer.n_added:
+                    warnings.warn(
+                        f"training on {buffer.size():,} rows that were added to the replay buffer; {self.dataset} is not read",
+                        DatasetWarning,
+                    )
             return
-        transitions = self._load_transitions()
+        transitions, known = self._load_transitions(), self.dataset_statistics
         buffer.attach(transitions, self.chosen_rows(transitions))
         info = transitions.info
         self.dataset_statistics = {
@@ -175,7 +222,16 @@ class AttachingMixin(OffPolicyAlgorithm):
             "reward_abs_max": float(max(abs(info.reward_min), abs(info.reward_max))),
             "return_range": info.return_range,
             "n_terminals": int(info.n_terminals),
+            "sample_hash": buffer.sample_hash(),
         }
+        if known is not None and (changes := _changes(known, self.dataset_statistics)):
+            self.dataset_statistics = known
+            buffer.reset()
+            raise DatasetIntegrityError(
+                f"these are not the rows the model was trained on: {changes}",
+                where=self.dataset,
+                hint="Read the data as before and give them to model.set_dataset(...); it also takes other data.",
+            )
         for text in self.check_dataset_fits(self._mean_reward(), info.n_terminals):
             warnings.warn(text, DatasetWarning)
         if self.normalize_obs:
@@ -209,9 +265,17 @@ class AttachingMixin(OffPolicyAlgorithm):
         """
         env = self._vec_normalize_env
         if env is None:
+            if self.trained_with_vec_normalize:
+                raise missing_vec_normalize(type(self).__name__)
             return
         env.training = False
-        assert isinstance(self.replay_buffer, OfflineReplayBuffer)
+        if env.norm_obs and self.normalize_obs:
+            raise ConfigError(
+                "both VecNormalize(norm_obs=True) and normalize_obs=True would standardise the observations",
+                key="normalize_obs",
+                hint="Set normalize_obs=False, or VecNormalize(norm_obs=False).",
+            )
+        self.trained_with_vec_normalize = env.norm_obs
         if env.norm_reward and _is_fresh(env.ret_rms):
             raise ConfigError(
                 "VecNormalize(norm_reward=True) has no statistics, and offline training cannot collect them",
@@ -219,7 +283,14 @@ class AttachingMixin(OffPolicyAlgorithm):
                 hint="Use norm_reward=False, or load statistics with VecNormalize.load.",
             )
         if env.norm_obs and isinstance(env.obs_rms, RunningMeanStd) and _is_fresh(env.obs_rms):
-            env.obs_rms.update(self.replay_buffer.observations[: self.replay_buffer.size(), 0])
+            buffer, seen = self._own_buffer(), env.obs_rms.count
+            if seen >= 1.0:
+                warnings.warn(
+                    f"VecNormalize has seen {seen:.0f} observations only; its statistics are now those of the dataset",
+                    DatasetWarning,
+                )
+            env.obs_rms = RunningMeanStd(shape=env.obs_rms.mean.shape)
+            env.obs_rms.update(buffer.observations[: buffer.size(), 0])
 
     def check_dataset_fits(self, reward_mean: float, n_terminals: int) -> list[str]:
         """
@@ -256,6 +327,40 @@ class AttachingMixin(OffPolicyAlgorithm):
                 module.set_statistics(mean, std)
 
 
+# Running statistics of fewer observations say nothing of a task: a reset or an episode of an untrained policy.
+FEWEST_OBSERVATIONS = 2000
+
+
 def _is_fresh(statistics: RunningMeanStd) -> bool:
-    """Whether running statistics have seen nothing and nobody has set them."""
-    return statistics.count < 1.0 and bool(np.all(statistics.mean == 0.0)) and bool(np.all(statistics.var == 1.0))
+    """Whether running statistics have seen next to nothing and nobody has set them."""
+    untouched = bool(np.all(statistics.mean == 0.0)) and bool(np.all(statistics.var == 1.0))
+    return untouched if statistics.count < 1.0 else statistics.count < FEWEST_OBSERVATIONS
+
+
+def as_dataset(source: Any) -> DatasetLike:
+    """
+    :param source: anything that holds logged steps
+    :return: name or path as it is; of everything else the transitions
+    :raises ConfigError: if it holds none
+    """
+    return source if isinstance(source, str | os.PathLike | Transitions) else load_dataset(source)
+
+
+def _algo_with_rows(cls: type) -> str:
+    """Name of the hyperparameter file: of a user's subclass without one it is that of the agent it extends."""
+    names = [vars(base)["algo_name"] for base in cls.__mro__ if "algo_name" in vars(base)]
+    known = hyperparams.known_algorithms()
+    return next((name for name in names if name in known), names[0])
+
+
+def _changes(known: dict[str, Any], found: dict[str, Any]) -> str:
+    """How the rows differ from those of the training so far; models of earlier versions know less of them."""
+    numbers = {name: value for name, value in found.items() if name != "sample_hash" and name in known}
+    changed = [
+        f"{name.replace('_', ' ')} {value:.6g} ({known[name]:.6g} then)"
+        for name, value in numbers.items()
+        if not math.isclose(value, known[name], rel_tol=1e-5, abs_tol=1e-9)
+    ]
+    if not changed and known.get("sample_hash", found["sample_hash"]) != found["sample_hash"]:
+        changed = ["as many, with other values"]
+    return ", ".join(changed)

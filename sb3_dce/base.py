@@ -7,7 +7,6 @@ callback keeps its meaning and an evaluation at step N sees exactly N updates.
 
 from __future__ import annotations
 
-import inspect
 import os
 import sys
 import time
@@ -39,6 +38,7 @@ from sb3_dce.checks import (
 from sb3_dce.envs import SpacesEnv
 from sb3_dce.errors import ConfigError, SB3DCEWarning
 from sb3_dce.execution import EXECUTIONS, Engine, Update, choose_execution, refuse_divergence
+from sb3_dce.hyperparams import constructor_parameters
 from sb3_dce.networks import StandardizedExtractor
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.precision import PRECISIONS, matmul_precision
@@ -49,6 +49,8 @@ SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
 
 # Metrics are read back at least this often (updates), so that a divergence is noticed even without logging.
 GUARD_INTERVAL = 1000
+# There as soon as a row of the log has its diagnostics.
+RECORDED = "train/n_updates"
 
 
 class OfflineAlgorithm(AttachingMixin, SavingMixin):
@@ -315,7 +317,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         """
         :return: constructor arguments in force, by name; environment and internal ones left out
         """
-        names = [n for n in inspect.signature(type(self)).parameters if n not in ("policy", "env", "_init_setup_model")]
+        names = [n for n in constructor_parameters(type(self)) if n not in ("policy", "env", "_init_setup_model")]
         return {name: getattr(self, name) for name in names if hasattr(self, name)}
 
     def make_storages(self) -> dict[str, Storage]:
@@ -385,6 +387,8 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         if engine is None or execution != engine.execution:
             storages = self.make_storages()
             assert execution is not None
+            if self.verbose >= 1 and execution != "eager":
+                print("Compiling the update, once per run: up to a minute.", flush=True)
             engine = Engine(self.make_update(storages), TrainState(storages), execution, planned_updates)
             if self._engine is not None:
                 engine.metrics = self._engine.metrics
@@ -487,12 +491,13 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
             log_due = log_interval is not None and self.num_timesteps % log_interval == 0
             if log_due:
                 self._record_metrics()
+                self._record_time()
             elif self.num_timesteps % GUARD_INTERVAL == 0:
                 self._refuse_divergence()
             if keep_going:
                 callback.update_locals(locals())
                 keep_going = bool(callback.on_step())
-                if log_due:
+                if log_due and RECORDED in self.logger.name_to_value:  # else a callback has just written the row
                     self.dump_logs()
         del new_obs, infos, rewards, dones
         return keep_going
@@ -526,7 +531,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         for name, value in metrics.items():
             self.logger.record(f"train/{name}", value)
         self.logger.record("train/learning_rate", self.lr_schedule(self._current_progress_remaining))
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record(RECORDED, self._n_updates, exclude="tensorboard")
         self._warn_of_large_values(metrics)
 
     def _warn_of_large_values(self, metrics: dict[str, float]) -> None:
@@ -544,10 +549,15 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
             )
 
     def dump_logs(self) -> None:
-        """Write one log row: gradient steps per second, elapsed seconds, timesteps."""
+        """Write one log row: diagnostics since the last, gradient steps per second, elapsed seconds, timesteps."""
+        if RECORDED not in self.logger.name_to_value:
+            self._record_metrics()
+        self._record_time()
+        self.logger.dump(step=self.num_timesteps)
+
+    def _record_time(self) -> None:
         elapsed = max((time.time_ns() - self.start_time) / 1e9, sys.float_info.epsilon)
         fps = int((self.num_timesteps - self._num_timesteps_at_start) / elapsed)
         self.logger.record("time/fps", fps)
         self.logger.record("time/time_elapsed", int(elapsed), exclude="tensorboard")
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
-        self.logger.dump(step=self.num_timesteps)

@@ -11,6 +11,7 @@ from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
 
 from sb3_dce.errors import ConfigError
+from sb3_dce.hyperparams import constructor_parameters
 
 
 def check_number(
@@ -73,7 +74,7 @@ def check_flags(owner: object) -> None:
         "no" would count as true
     :raises ConfigError: if one is not
     """
-    for name, parameter in inspect.signature(type(owner)).parameters.items():
+    for name, parameter in constructor_parameters(type(owner)).items():
         value = getattr(owner, name, False)  # not every argument is kept
         if parameter.annotation == "bool" and not isinstance(value, (bool, np.bool_)):
             raise ConfigError(f"{name} must be True or False, got {value!r}", key=name)
@@ -143,12 +144,22 @@ def check_policy_kwargs(given: Any, policy_class: type, settings: dict[str, Any]
         hint = "For example {'net_arch': [256, 256]}."
         raise ConfigError(f"policy_kwargs must be a dictionary, got {given!r}", key="policy_kwargs", hint=hint)
     parameters = inspect.signature(policy_class).parameters
-    known = [name for name in parameters if name not in ("observation_space", "action_space", "lr_schedule", "use_sde")]
     takes_all = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values())
+    if not takes_all and (foreign := sorted(set(settings) - set(parameters))):
+        hint = "Derive it from the agent's own policy (sb3_dce.policies), which 'MlpPolicy' stands for."
+        what = f"{policy_class.__name__} does not take {', '.join(foreign)}, which this agent gives to its policy"
+        raise ConfigError(what, key="policy", hint=hint)
+    known = [name for name in parameters if name not in ("observation_space", "action_space", "lr_schedule", "use_sde")]
     for name, value in given.items():
         if name not in parameters and not takes_all:
             hint = f"It has {', '.join(known)}."
             raise ConfigError(f"{policy_class.__name__} has no parameter {name!r}", where="policy_kwargs", key=name, hint=hint)
+        if name == "features_extractor_class" and name in settings and not issubclass(value, settings[name]):
+            hint = f"Set normalize_obs=False, or derive it from sb3_dce.networks.{settings[name].__name__}."
+            what = (
+                f"normalize_obs=True standardises observations in the features extractor, which {value.__name__} would replace"
+            )
+            raise ConfigError(what, key=name, hint=hint)
         if name in settings and name not in ("net_arch", "features_extractor_class"):
             hint = "It follows from the agent's own parameters: set it there, or leave it out."
             raise ConfigError(f"{name}={value!r} in policy_kwargs would contradict the agent", key=name, hint=hint)
@@ -179,6 +190,19 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
     if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
         hint = "Bound them with gymnasium.wrappers.RescaleAction or a space of your own: agents act within the bounds."
         raise ConfigError(f"actions must have finite bounds, got {action_space}", key="env", hint=hint)
+
+
+def missing_vec_normalize(name: str) -> ConfigError:
+    """
+    :param name: of the agent's class
+    :return: for a model that was trained behind a ``VecNormalize`` and is used without one
+    """
+    return ConfigError(
+        "the model was trained behind a VecNormalize and has none now: it would see other observations than it knows",
+        key="env",
+        hint=f"Load it with {name}.load(<model>, env=VecNormalize.load(<statistics>, <environment>)). Statistics that stay in "
+        "the model itself: normalize_obs=True.",
+    )
 
 
 def check_ends_with_evaluation(n_updates: int, eval_freq: int, whose: str = "") -> None:

@@ -49,7 +49,7 @@ class OfflineCQL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
     The sum over actions is estimated from uniform actions, actions of the policy at s and actions of the policy at s' (all
     valued at s), each divided by its density. All hidden layers have 256 units, three per network. The target has no
     entropy term. Differences from the authors' code: none in the formulas; one Adam over both critics, which is the same
-    as one each.
+    as one each; targets start as copies of the critics, with PyTorch's first weights.
 
     Parameters not listed here are described in :class:`~sb3_dce.base.OfflineAlgorithm`.
 

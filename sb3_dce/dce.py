@@ -344,8 +344,11 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
         return (n_updates // every + 1) * every
 
     def derived_metrics(self, means: dict[str, float]) -> dict[str, float]:
+        # Q is linear in beta: every change of beta shifts it as if it had been there alone
+        n, changes = self._n_updates, self._beta_schedule().changes(self._n_updates)
+        shift = sum(shift_factor(n - at, self.gamma, self.tau) * beta_eff(by, self.td_loss_coef) for at, by in changes)
         extra = {
-            "beta_pred_shift": shift_factor(self._n_updates, self.gamma, self.tau) * means["beta_eff"],
+            "beta_pred_shift": shift,
             "epoch": self._n_updates / self.steps_per_epoch,
         }
         if self.dataset_statistics is not None:

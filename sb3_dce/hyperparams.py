@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import yaml
 
 from sb3_dce.data import catalog
+from sb3_dce.data.records import READER_OPTIONS
 from sb3_dce.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -135,6 +136,23 @@ def split_row(row: dict[str, Any]) -> SplitRow:
     return SplitRow(kwargs, int(row["n_timesteps"]), zoo)
 
 
+def constructor_parameters(cls: type) -> dict[str, inspect.Parameter]:
+    """
+    :param cls: class; where its constructor takes ``**kwargs``, those of its bases count, too
+    :return: parameters by name, without ``self``, ``*args`` and ``**kwargs``
+    """
+    found: dict[str, inspect.Parameter] = {}
+    for base in cls.__mro__:
+        if "__init__" not in vars(base):
+            continue
+        parameters = list(inspect.signature(vars(base)["__init__"]).parameters.values())[1:]
+        variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+        found |= {p.name: p for p in parameters if p.kind not in variable and p.name not in found}
+        if not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):
+            break
+    return found
+
+
 def check_keys(cls: type, keys: Iterable[str], where: str = "hyperparameters", zoo_keys: bool = True) -> None:
     """
     Refuse a key that neither the constructor nor the zoo knows; otherwise it surfaces as a ``TypeError`` much later.
@@ -145,16 +163,14 @@ def check_keys(cls: type, keys: Iterable[str], where: str = "hyperparameters", z
     :param zoo_keys: whether keys that only the zoo's launcher reads are allowed
     :raises ConfigError: naming the key, the closest parameter and the file
     """
-    parameters = [name for name in inspect.signature(cls).parameters if not name.startswith("_")]
+    parameters = [name for name in constructor_parameters(cls) if not name.startswith("_")]
     allowed = {*parameters, *(ZOO_KEYS if zoo_keys else ())}
     for key in keys:
         if key not in allowed:
-            raise ConfigError(
-                f"{cls.__name__} has no parameter {key!r}",
-                where=where,
-                key=key,
-                hint=did_you_mean(key, allowed).strip() or f"Its parameters: {', '.join(parameters)}.",
-            )
+            hint = did_you_mean(key, allowed).strip() or f"Its parameters: {', '.join(parameters)}."
+            if key in READER_OPTIONS:
+                hint = f"It belongs to the reader of data: give sb3_dce.load_dataset(<file>, {key}=...) as the dataset."
+            raise ConfigError(f"{cls.__name__} has no parameter {key!r}", where=where, key=key, hint=hint)
 
 
 def did_you_mean(name: str, candidates: Iterable[str]) -> str:

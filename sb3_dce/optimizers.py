@@ -8,7 +8,7 @@ compiled or captured step never bakes in a number that changes.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch as th
@@ -35,6 +35,7 @@ class AdamSettings:
     :param eps: added to the root of the second moment
     :param weight_decay: L2 coefficient
     :param decoupled: True for AdamW (decay of the parameters), False for Adam (decay added to the gradient)
+    :param trained: True for each parameter that takes part, shape (n_parameters,); ``None`` for all
     """
 
     beta1: float = 0.9
@@ -42,13 +43,15 @@ class AdamSettings:
     eps: float = 1e-8
     weight_decay: float = 0.0
     decoupled: bool = False
+    trained: th.Tensor | None = field(default=None, compare=False)
 
     @classmethod
-    def of(cls, optimizer: th.optim.Optimizer) -> AdamSettings:
+    def of(cls, optimizer: th.optim.Optimizer, trained: th.Tensor | None = None) -> AdamSettings:
         """
         Read the constants of a torch optimizer.
 
         :param optimizer: ``torch.optim.Adam`` or ``torch.optim.AdamW`` with one parameter group
+        :param trained: see the class
         :return: its constants
         :raises ConfigError: for any other optimizer, or for options this package does not implement
         """
@@ -70,6 +73,7 @@ class AdamSettings:
             eps=group["eps"],
             weight_decay=group["weight_decay"],
             decoupled=isinstance(optimizer, th.optim.AdamW),
+            trained=trained,
         )
 
 
@@ -99,4 +103,6 @@ def adam_step(learner: Learner, gradient: th.Tensor, learning_rate: th.Tensor, s
     # parameters. On a GPU it may, which is why this is not done in float64.
     step_size, root_correction = th.stack([step_size, root_correction]).unbind()
     params = params - step_size * exp_avg / (exp_avg_sq.sqrt() / root_correction + settings.eps)
+    if settings.trained is not None:
+        params = th.where(settings.trained, params, learner.params)  # not even by weight decay or what the moments remember
     return Learner(params, exp_avg, exp_avg_sq, step)

@@ -44,7 +44,8 @@ class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OODWeight, OfflineAlgor
     are positive; see ``pseudo_target_floor`` for other data. All hidden layers have 256 units, three per network.
 
     Differences from the authors' code: one Adam over all critics, which is the same as one each; online and target critics
-    share their random priors (the code draws them anew for the targets), and the actor's gradient passes through them.
+    share their random priors (the code draws them anew for the targets), and the actor's gradient passes through them; targets
+    start as copies of the critics, with PyTorch's first weights.
 
     Parameters not listed here are described in :class:`~sb3_dce.base.OfflineAlgorithm`.
 

@@ -105,13 +105,18 @@ class SavingMixin(OffPolicyAlgorithm):
             (changed) configuration
         """
         hyperparams.check_keys(cls, kwargs, where=f"{cls.__name__}.load")
-        source = cls._own_file(path)
+        source, dataset = cls._own_file(path), kwargs.pop("dataset", None)
         try:
-            return super().load(source, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+            model = super().load(source, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         except (zipfile.BadZipFile, pickle.UnpicklingError, EOFError, RuntimeError) as error:
             raise CheckpointError(
                 f"the model cannot be read: {str(error).splitlines()[0][:200]}", where=_name_of(source), hint=DAMAGED
             ) from error
+        if kwargs.get("seed") is not None:  # the saved state of the generator would go on as if nothing had been asked for
+            model.set_random_seed(kwargs["seed"])
+        if dataset is not None:
+            model.set_dataset(dataset)  # type: ignore[attr-defined]  # AttachingMixin has it
+        return model
 
     @classmethod
     def _own_file(cls, path: str | Path | io.BufferedIOBase) -> Path | io.BufferedIOBase:

@@ -51,3 +51,16 @@ class StepSchedule:
             return self.initial
         moved = self.initial - (n_updates // self.every) * self.rate
         return max(moved, self.final) if self.final <= self.initial else min(moved, self.final)
+
+    def changes(self, n_updates: int) -> list[tuple[int, float]]:
+        """
+        :param n_updates: completed updates
+        :return: completed updates at which the value changed, from 0 on, and by how much
+        """
+        found = [(0, self.initial)] if n_updates > 0 else []
+        for at in range(self.every, n_updates, self.every):
+            step = self.value(at) - self.value(at - self.every)
+            if step == 0.0:
+                break
+            found.append((at, step))
+        return found

@@ -83,7 +83,8 @@ class Storage:
     def __init__(self, parameters: list[th.Tensor], optimizer: th.optim.Optimizer | None = None) -> None:
         self._parameters = parameters
         self._optimizer = optimizer
-        self.settings = None if optimizer is None else AdamSettings.of(optimizer)
+        self._frozen = [not p.requires_grad for p in parameters]
+        self.settings = None if optimizer is None else AdamSettings.of(optimizer, self._trained())
         self._bind()
 
     @classmethod
@@ -95,6 +96,11 @@ class Storage:
         optimizer = getattr(module, "optimizer", None)
         assert optimizer is None or isinstance(optimizer, th.optim.Optimizer)
         return cls(list(module.parameters()), optimizer)
+
+    def _trained(self) -> th.Tensor | None:
+        if not any(self._frozen):
+            return None
+        return _flatten([th.full(p.shape, p.requires_grad, device=p.device) for p in self._parameters])
 
     def _bind(self) -> None:
         self.params = _flatten([p.detach() for p in self._parameters])
@@ -122,13 +128,16 @@ class Storage:
     def is_bound(self) -> bool:
         """
         :return: whether the parameters and moments are still views of this storage; ``load_state_dict`` of an optimizer,
-            ``module.to(...)`` and Stable-Baselines3's ``load`` put other tensors in their place
+            ``module.to(...)`` and Stable-Baselines3's ``load`` put other tensors in their place; and whether the same ones are
+            frozen (``requires_grad``)
         """
         # asked before every update of ``learn``, so by addresses that are known instead of by views made anew
         if any(p.data_ptr() != address for p, address in zip(self._parameters, self._pointers, strict=True)):
             return False
         if self._optimizer is None:
             return True
+        if any(p.requires_grad is frozen for p, frozen in zip(self._parameters, self._frozen, strict=True)):
+            return False
         state = self._optimizer.state
         return all(
             p in state and state[p]["exp_avg"].data_ptr() == address and state[p]["step"] is self.step

@@ -88,7 +88,9 @@ def _step(
     settings: AdamSettings,
     max_grad_norm: float | None,
 ) -> tuple[Learner, th.Tensor]:
-    """Clip and step; the norm is that before clipping."""
+    """Clip and step; the norm is that before clipping, of the parameters that are trained."""
+    if settings.trained is not None:
+        gradient = gradient * settings.trained
     norm = th.linalg.vector_norm(gradient)
     if max_grad_norm is not None:
         # The small constant is that of torch.nn.utils.clip_grad_norm_.

@@ -64,8 +64,10 @@ from sb3_dce.errors import (
     DatasetWarning,
     DivergenceError,
 )
+from sb3_dce.evaluation import evaluate
 from sb3_dce.execution import Engine
 from sb3_dce.networks import StandardizedExtractor
+from sb3_dce.rollouts import Rollouts
 
 
 class Agent(NamedTuple):
@@ -662,6 +664,14 @@ class TwoLayers(BaseFeaturesExtractor):
         return self.layer(observations).tanh()
 
 
+class Frozen(TwoLayers):
+    """A pretrained extractor that is not to be trained."""
+
+    def __init__(self, observation_space: spaces.Box) -> None:
+        super().__init__(observation_space)
+        self.requires_grad_(False)
+
+
 class WithBatchNorm(TwoLayers):
     """An extractor whose buffers would change inside the update."""
 
@@ -686,7 +696,7 @@ class WithBatchNorm(TwoLayers):
 def test_policy_arguments(agent: Agent, hdf5_file: Path, tmp_path: Path, policy_kwargs: dict[str, Any]) -> None:
     if "n_critics" in policy_kwargs and accepts(agent, "n_critics"):
         pytest.skip("an argument of the agent, refused here")
-    model = make(agent, dataset=hdf5_file, policy_kwargs=policy_kwargs)
+    model = make(agent, dataset=hdf5_file, policy_kwargs=policy_kwargs, normalize_obs=False)
     start = weights(model)
     model.learn(3)
     after = weights(model)
@@ -711,7 +721,7 @@ def test_unsupported_policy_arguments_are_refused(
     agent: Agent, transitions: Transitions, policy_kwargs: dict[str, Any], error: str
 ) -> None:
     with pytest.raises(ConfigError, match=error):
-        make(agent, dataset=transitions, policy_kwargs=policy_kwargs).learn(1)
+        make(agent, dataset=transitions, policy_kwargs=policy_kwargs, normalize_obs=False).learn(1)
 
 
 @pytest.mark.parametrize("name", ["CnnPolicy", "MultiInputPolicy", "MlpPolice"])
@@ -844,7 +854,7 @@ def test_observation_statistics_of_vec_normalize_are_used(
         original(self, batch, *args, **kwargs)
 
     monkeypatch.setattr(Engine, "step", step)
-    make(agent, env=env, dataset=transitions).learn(1)
+    make(agent, env=env, dataset=transitions, normalize_obs=False).learn(1)
     make(agent, dataset=transitions).learn(1)
     normalised, raw = (batch.observations.numpy() for batch in batches)
     assert np.allclose(normalised, (raw - 0.5) / np.sqrt(4.0 + 1e-8), atol=1e-6)
@@ -855,24 +865,84 @@ def test_evaluation_environment_may_be_normalised_too(
 ) -> None:
     env, eval_env = (VecNormalize(DummyVecEnv([make_point_mass]), norm_reward=False) for _ in range(2))
     callback = EvalCallback(eval_env, eval_freq=2, n_eval_episodes=1, verbose=0, warn=False)
-    assert make(agent, env=env, dataset=transitions).learn(4, callback, log_interval=None).num_timesteps == 4
+    model = make(agent, env=env, dataset=transitions, normalize_obs=False)
+    assert model.learn(4, callback, log_interval=None).num_timesteps == 4
 
 
 def test_fresh_observation_statistics_are_taken_from_the_data(
     agent: Agent, transitions: Transitions, make_point_mass: Callable[[], gym.Env]
 ) -> None:
     """The reset at the start of ``learn()`` would otherwise fit them to a single observation."""
+    for looks in (0, 3):  # the second time somebody has looked at the environment before
+        env = VecNormalize(DummyVecEnv([make_point_mass]), norm_reward=False)
+        model = make(agent, env=env, dataset=transitions, normalize_obs=False)
+        for _ in range(looks):
+            env.reset()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            model.learn(2)
+        assert any("VecNormalize has seen 3 observations" in str(w.message) for w in caught) is bool(looks)
+        assert np.allclose(env.obs_rms.mean, transitions.observations.mean(axis=0), atol=1e-4)
+        assert np.allclose(env.obs_rms.var, transitions.observations.var(axis=0), rtol=1e-2)
+
+
+def test_observations_are_not_standardised_twice(
+    agent: Agent, transitions: Transitions, make_point_mass: Callable[[], gym.Env]
+) -> None:
     env = VecNormalize(DummyVecEnv([make_point_mass]), norm_reward=False)
-    make(agent, env=env, dataset=transitions).learn(2)
-    assert np.allclose(env.obs_rms.mean, transitions.observations.mean(axis=0), atol=1e-4)
-    assert np.allclose(env.obs_rms.var, transitions.observations.var(axis=0), rtol=1e-2)
+    with pytest.raises(ConfigError, match=r"both VecNormalize.* and normalize_obs=True"):
+        make(agent, env=env, dataset=transitions, normalize_obs=True).learn(1)
+    with pytest.raises(ConfigError, match="TwoLayers would replace"):
+        make(agent, dataset=transitions, normalize_obs=True, policy_kwargs={"features_extractor_class": TwoLayers})
+
+
+def test_model_trained_behind_vec_normalize_is_not_used_without(
+    agent: Agent, transitions: Transitions, make_point_mass: Callable[[], gym.Env], tmp_path: Path
+) -> None:
+    def wrapped() -> VecNormalize:
+        return VecNormalize(DummyVecEnv([make_point_mass]), norm_reward=False)
+
+    env = wrapped()
+    model = make(agent, env=env, dataset=transitions, normalize_obs=False, seed=0).learn(5)
+    rollouts = Rollouts(make_point_mass, 1)
+    env.seed(7)
+    expected, _ = evaluate_policy(model, model.get_env(), 1, return_episode_rewards=True, warn=False)
+    assert evaluate(model, rollouts, seed=7).returns == pytest.approx(expected, abs=1e-5)
+    model.save(tmp_path / "model.zip")
+    env.save(str(tmp_path / "statistics.pkl"))
+    loaded = agent.cls.load(tmp_path / "model.zip")
+    loaded.set_dataset(transitions)
+    with pytest.raises(ConfigError, match="behind a VecNormalize"):
+        loaded.learn(1)
+    with pytest.raises(ConfigError, match="behind a VecNormalize"):
+        evaluate(loaded, rollouts, seed=7)
+    statistics = VecNormalize.load(str(tmp_path / "statistics.pkl"), wrapped().venv)
+    loaded = agent.cls.load(tmp_path / "model.zip", env=statistics)
+    assert evaluate(loaded, rollouts, seed=7).returns == pytest.approx(expected, abs=1e-5)
+
+
+def test_frozen_parameters_stay(agent: Agent, transitions: Transitions) -> None:
+    model = make(agent, dataset=transitions, normalize_obs=False, policy_kwargs={"features_extractor_class": Frozen})
+    start = weights(model)
+    model.learn(3)
+    fixed = [k for k in start if "features_extractor" in k and k.startswith("policy.") and "target" not in k]
+    assert fixed and all(th.equal(start[k], weights(model)[k]) for k in fixed)
+    # and from one learn() to the next
+    for parameter in model.actor.parameters():
+        parameter.requires_grad_(False)
+    before = weights(model)
+    model.learn(3)
+    after = weights(model)
+    names = [k for k in before if k.startswith("policy.actor.")]
+    assert names and all(th.equal(before[k], after[k]) for k in names)
 
 
 def test_fresh_reward_statistics_are_refused(
     agent: Agent, transitions: Transitions, make_point_mass: Callable[[], gym.Env]
 ) -> None:
     with pytest.raises(ConfigError, match="norm_reward"):
-        make(agent, env=VecNormalize(DummyVecEnv([make_point_mass])), dataset=transitions).learn(2)
+        env = VecNormalize(DummyVecEnv([make_point_mass]))
+        make(agent, env=env, dataset=transitions, normalize_obs=False).learn(2)
 
 
 def test_d4rl_rows_cannot_be_asked_of_transitions_made_without_them(agent: Agent, transitions: Transitions) -> None:

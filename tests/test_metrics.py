@@ -130,3 +130,12 @@ def test_expected_shift_and_epoch_are_logged(transitions: Transitions) -> None:
     metrics = model.read_metrics()
     assert metrics["beta_pred_shift"] == pytest.approx(2.0 * (1 + 0.99 * 0.005), rel=1e-6)
     assert metrics["epoch"] == 0.2
+
+
+def test_expected_shift_follows_every_change_of_beta(transitions: Transitions) -> None:
+    model = dce(transitions, beta=4.0, beta_final=0.5, beta_rate=1.0, beta_update_every=1, steps_per_epoch=3)
+    target = shift = 0.0
+    for n in range(15):  # the closed form's recursion, with beta as it is: 4, 3, 2, 1, 0.5
+        shift = 0.99 * target + max(4.0 - n // 3, 0.5) / 2
+        target += 0.005 * (shift - target)
+    assert model.learn(15, log_interval=None).read_metrics()["beta_pred_shift"] == pytest.approx(shift, rel=1e-9)

@@ -32,6 +32,7 @@ from sb3_dce.files import write_atomically
 
 _READ_BYTES = 2**20
 _MAX_HEADER_BYTES = 10_000  # NumPy's own limit, which it looks at when it has read the header
+_MAX_TEXT_BYTES = 2**16
 _MAX_DIRECTORY_BYTES = 4 * 2**20
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
@@ -57,6 +58,26 @@ def arrays_from_npz(path: str | PathLike[str], *, max_bytes: int = DEFAULT_MAX_B
             for info in archive.infolist():  # a damaged name would pass for an array that is not there
                 archive.open(info).close()
             return {key: _read_member(archive, member, key, path) for key, member in members.items()}
+
+
+def text_from_npz(path: str | PathLike[str], key: str) -> str | None:
+    """
+    :param path: file that :func:`arrays_from_npz` has read
+    :param key: name of a member without dimensions, as :func:`write_npz` stores a text
+    :return: the text, empty if the member holds something else; ``None`` if it is not there
+    """
+    with _zip_errors(Path(path)), zipfile.ZipFile(path) as archive:
+        infos = {info.filename: info for info in archive.infolist()}
+        info = infos.get(f"{key}.npy")
+        if info is None:
+            return None
+        with archive.open(info) as stream:
+            head = io.BytesIO(stream.read(_MAX_TEXT_BYTES))
+    try:
+        value = npy.read_array(head, allow_pickle=False, max_header_size=_MAX_HEADER_BYTES)
+    except (ValueError, TypeError, SyntaxError, tokenize.TokenError, MemoryError, RecursionError):
+        return ""
+    return str(value) if value.dtype.kind == "U" and value.shape == () else ""
 
 
 def npz_keys(path: str | PathLike[str]) -> list[str]:

@@ -157,6 +157,10 @@ class ReadOptions:
         return low, high
 
 
+# Arguments of the readers that are none of an agent.
+READER_OPTIONS = frozenset({f.name for f in fields(ReadOptions)} | {"columns", "sep", "flatten", "trust", "sha256"})
+
+
 @dataclass(frozen=True, eq=False)
 class DatasetInfo:
     """

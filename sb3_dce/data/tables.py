@@ -70,7 +70,12 @@ def arrays_from_dataframe(frame: pd.DataFrame, columns: Columns | None = None) -
 
 
 def arrays_from_csv(
-    path: str | PathLike[str], columns: Columns | None = None, *, sep: str = ",", max_bytes: int = DEFAULT_MAX_BYTES
+    path: str | PathLike[str],
+    columns: Columns | None = None,
+    *,
+    sep: str = ",",
+    max_bytes: int = DEFAULT_MAX_BYTES,
+    blank_is_nan: bool = False,
 ) -> dict[str, np.ndarray]:
     """
     Arrays from a text file with a line of column names. Flags may be 0/1 or True/False.
@@ -79,6 +84,7 @@ def arrays_from_csv(
     :param columns: key to column name or names; keys left out are found by name
     :param sep: separator, one character
     :param max_bytes: largest size of the file
+    :param blank_is_nan: take an empty cell, as which pandas writes NaN, for NaN; not of flags
     :return: key to array, float64
     :raises DatasetFormatError: if a column is missing or a line is wrong; the message has its number and the column
     :raises DatasetError: if the file is missing, too large, or not text
@@ -90,9 +96,8 @@ def arrays_from_csv(
     try:
         with translated_errors(path), open(path, encoding="utf-8-sig", newline="") as file:
             lines = _lines(file, path)
-            return _read_csv(
-                _Records(csv.reader(lines, delimiter=sep, skipinitialspace=True, strict=True)), columns, path, sep
-            )
+            records = _Records(csv.reader(lines, delimiter=sep, skipinitialspace=True, strict=True))
+            return _read_csv(records, columns, path, sep, blank_is_nan)
     except DatasetIntegrityError as exc:
         if not isinstance(exc.__cause__, UnicodeDecodeError):
             raise
@@ -304,14 +309,14 @@ class _Records:
                 yield record
 
 
-def _read_csv(records: _Records, columns: Columns | None, path: Path, sep: str) -> dict[str, np.ndarray]:
+def _read_csv(records: _Records, columns: Columns | None, path: Path, sep: str, blank_is_nan: bool) -> dict[str, np.ndarray]:
     try:
-        return _split(records, columns, path, sep)
+        return _split(records, columns, path, sep, blank_is_nan)
     except csv.Error as exc:
         raise _Line(path, records.line).fault(f"not a table: {exc}", "Check the quotes of this line") from exc
 
 
-def _split(records: _Records, columns: Columns | None, path: Path, sep: str) -> dict[str, np.ndarray]:
+def _split(records: _Records, columns: Columns | None, path: Path, sep: str, blank_is_nan: bool) -> dict[str, np.ndarray]:
     """Read all numbers into one matrix, then cut it into columns."""
     rows = iter(records)
     names = next(rows, [])
@@ -326,14 +331,19 @@ def _split(records: _Records, columns: Columns | None, path: Path, sep: str) -> 
     flags = [n for n, (key, _) in enumerate(cells_of_keys) if key in FLAG_KEYS]
     matrix = read_plain(path, sep, records.lines_read, len(names), cells, flags)
     if matrix is None:
-        matrix = _by_record(rows, records, names, cells_of_keys, path)
+        matrix = _by_record(rows, records, names, cells_of_keys, path, blank_is_nan)
     edges = np.cumsum([len(chosen) for chosen in found.values()])[:-1]
     parts = dict(zip(found, np.split(matrix, edges, axis=1), strict=True))
     return {key: part if key in MATRIX_KEYS else part[:, 0] for key, part in parts.items()}
 
 
 def _by_record(
-    rows: Iterable[list[str]], records: _Records, names: Sequence[str], cells_of_keys: Sequence[tuple[str, int]], path: Path
+    rows: Iterable[list[str]],
+    records: _Records,
+    names: Sequence[str],
+    cells_of_keys: Sequence[tuple[str, int]],
+    path: Path,
+    blank_is_nan: bool,
 ) -> np.ndarray:
     """Numbers of the wanted cells, shape (rows, cells), read one record after the other."""
     flags = [n for n, (key, _) in enumerate(cells_of_keys) if key in FLAG_KEYS]
@@ -346,6 +356,8 @@ def _by_record(
                 "Complete the line, or take it out; quote commas in text",
             )
         cells = list(pick(record))
+        if blank_is_nan:
+            cells = [cell if cell.strip() or n in flags else "nan" for n, cell in enumerate(cells)]
         for n in flags:
             cells[n] = without_word(cells[n])
         numbers = numbers_of(cells)
@@ -365,7 +377,9 @@ def _bad_cell(
     cell = record[i]
     what, hint = f"{cell[:60]!r} is not a number", "Write numbers with a decimal point, such as -0.5 or 1e-3"
     if not cell.strip():
-        what, hint = "empty cell", "Fill it in, or take the line out"
+        what = "empty cell"
+        # without the line its neighbours would pass for one step after the other
+        hint = "Fill it in" if key in FLAG_KEYS else "Fill it in, or pass drop_nonfinite=True, which leaves this step out"
     elif cell.startswith("="):
         what, hint = f"a formula, {cell[:60]!r}; it was not computed", "Save the values instead of the formulas"
     elif "," in cell:

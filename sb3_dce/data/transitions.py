@@ -19,7 +19,7 @@ from sb3_dce.data.hdf5 import D4RLFile, write_hdf5
 from sb3_dce.data.layout import CORE_KEYS, ArraySource, RowLayout
 from sb3_dce.data.minari import METADATA_FILE, Flatten, action_bounds, find_minari, reward_note
 from sb3_dce.data.minari_episodes import open_episodes
-from sb3_dce.data.npz import arrays_from_npz, npz_keys, write_npz
+from sb3_dce.data.npz import arrays_from_npz, npz_keys, text_from_npz, write_npz
 from sb3_dce.data.records import BOUNDS_ATTRIBUTE, DatasetInfo, ReadOptions, bounds_attribute
 from sb3_dce.data.row_cache import cached_rows
 from sb3_dce.data.sb3_buffer import arrays_from_replay_buffer, load_saved_buffer
@@ -146,7 +146,10 @@ class Transitions:
         def read() -> dict[str, np.ndarray]:
             return arrays_from_npz(path, max_bytes=read_options.max_bytes)
 
-        return cls._from_file(read, path, spec, read_options, {"name": "npz"}, npz_keys)
+        def bounded() -> ReadOptions:
+            return read_options.with_bounds_of(text_from_npz(path, BOUNDS_ATTRIBUTE), str(path))
+
+        return cls._from_file(read, path, spec, read_options, {"name": "npz", "bounds": True}, npz_keys, bounded)
 
     @classmethod
     def from_csv(
@@ -173,7 +176,8 @@ class Transitions:
         read_options = ReadOptions.of(options)
 
         def read() -> dict[str, np.ndarray]:
-            return arrays_from_csv(path, columns, sep=sep, max_bytes=read_options.max_bytes)
+            blank_is_nan = read_options.drop_nonfinite
+            return arrays_from_csv(path, columns, sep=sep, max_bytes=read_options.max_bytes, blank_is_nan=blank_is_nan)
 
         return cls._from_file(read, path, spec, read_options, {"name": "csv", "columns": columns, "sep": sep})
 
@@ -285,14 +289,15 @@ class Transitions:
         options: ReadOptions,
         reader: Mapping[str, Any],
         keys_of: Callable[[Path], list[str]] | None = None,
+        bounded: Callable[[], ReadOptions] | None = None,
     ) -> Transitions:
         file = Path(path)
 
         def build() -> BuiltRows:
             arrays = read()
             found_keys = keys_of(file) if keys_of else arrays
-            dataset_id = spec.id if spec else file.stem
-            return build_rows(arrays, dataset_id=dataset_id, path=file, found_keys=found_keys, spec=spec, options=options)
+            dataset_id, in_force = spec.id if spec else file.stem, bounded() if bounded else options
+            return build_rows(arrays, dataset_id=dataset_id, path=file, found_keys=found_keys, spec=spec, options=in_force)
 
         return cls._of(cached_rows(file, spec, options, reader, build))
 
@@ -318,6 +323,9 @@ class Transitions:
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    def __repr__(self) -> str:
+        return f"<Transitions: {self.summary()[0]}>"
 
     @property
     def observations(self) -> np.ndarray:

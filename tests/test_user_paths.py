@@ -1,0 +1,221 @@
+"""What users of Stable-Baselines3 naturally try next, where an answer must be right or in words; DCE stands for all agents."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import pytest
+import torch as th
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import EvalCallback, LogEveryNTimesteps
+from stable_baselines3.common.logger import configure
+from stable_baselines3.sac.policies import SACPolicy
+
+from sb3_dce import OfflineDCE, OfflineSAC, Transitions, load_dataset
+from sb3_dce.envs import SpacesEnv
+from sb3_dce.errors import ConfigError, DatasetIntegrityError, DatasetWarning
+
+SMALL: dict[str, Any] = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "execution": "eager"}
+TINY = "halfcheetah-tiny-sb3"
+
+
+def flat(model: OfflineDCE) -> th.Tensor:
+    return th.cat([p.detach().flatten() for p in model.policy.parameters()])
+
+
+def arrays(n: int = 60, scale: float = 1.0) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return {
+        "observations": rng.standard_normal((n, 3)),
+        "actions": scale * rng.uniform(-1, 1, (n, 1)),
+        "rewards": rng.standard_normal(n),
+        "terminals": np.zeros(n, dtype=bool),
+        "timeouts": np.arange(n) % 20 == 19,
+    }
+
+
+@pytest.fixture
+def table(tmp_path: Path) -> Path:
+    """A log with two columns that could be the reward."""
+    data = arrays()
+    frame = pd.DataFrame(data["observations"], columns=["obs_0", "obs_1", "obs_2"])
+    frame = frame.assign(action_0=data["actions"][:, 0], reward=data["rewards"], good_reward=data["rewards"] + 1.0)
+    frame.assign(terminal=0, timeout=data["timeouts"].astype(int)).to_csv(tmp_path / "log.csv", index=False)
+    return tmp_path / "log.csv"
+
+
+@pytest.fixture
+def sac(make_point_mass: Callable[[], gym.Env]) -> SAC:
+    return SAC("MlpPolicy", make_point_mass(), learning_starts=1000, policy_kwargs={"net_arch": [8]}, seed=0).learn(60)
+
+
+# -- going on ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options", [{"columns": {"rewards": "good_reward"}}, {"columns": {"observations": ["obs_1", "obs_0", "obs_2"]}}], ids=str
+)
+def test_loaded_model_does_not_go_on_with_other_rows_of_its_file(options: dict[str, Any], table: Path, tmp_path: Path) -> None:
+    data = load_dataset(table, **options)
+    model = OfflineDCE.load_dataset(data, seed=0, **SMALL).learn(3)
+    model.save(tmp_path / "model.zip")
+    loaded = OfflineDCE.load(tmp_path / "model.zip")
+    with pytest.raises(DatasetIntegrityError, match=r"not the rows the model was trained on.*set_dataset\("):
+        loaded.learn(3, reset_num_timesteps=False)
+    loaded.set_dataset(load_dataset(table, **options))
+    loaded.learn(3, reset_num_timesteps=False)
+    assert th.equal(flat(loaded), flat(model.learn(3, reset_num_timesteps=False)))
+
+
+def test_set_dataset_takes_other_data_on_purpose(table: Path) -> None:
+    model = OfflineDCE.load_dataset(table, **SMALL).learn(2)
+    model.set_dataset(load_dataset(table, columns={"rewards": "good_reward"}))
+    before = model.learn(2).dataset_statistics
+    assert before is not None and before["reward_mean"] == pytest.approx(arrays()["rewards"][:].mean() + 1.0, abs=0.1)
+
+
+def test_seed_given_at_load_counts(tmp_path: Path) -> None:
+    OfflineDCE.load_dataset(TINY, seed=0, **SMALL).learn(2).save(tmp_path / "model.zip")
+    trained = [OfflineDCE.load(tmp_path / "model.zip", seed=seed).learn(3) for seed in (1, 2, 1)]
+    assert not th.equal(flat(trained[0]), flat(trained[1])) and th.equal(flat(trained[0]), flat(trained[2]))
+
+
+def test_dataset_given_at_load_counts(table: Path, tmp_path: Path) -> None:
+    model = OfflineDCE.load_dataset(table, **SMALL).learn(2)
+    model.save(tmp_path / "model.zip")
+    data = load_dataset(table, columns={"rewards": "good_reward"})
+    loaded = OfflineDCE.load(tmp_path / "model.zip", dataset=data).learn(2)
+    assert np.allclose(loaded.replay_buffer.rewards[:, 0], data.rewards)
+
+
+# -- what counts as data -----------------------------------------------------------------------------------------------
+
+
+def test_agents_take_what_the_front_door_takes(sac: SAC, spaces_env: SpacesEnv) -> None:
+    frame = pd.DataFrame({"obs_0": [0.1, 0.2, 0.3], "action_0": [0.0, 0.5, -0.5], "reward": 1.0, "terminal": [0, 0, 1]})
+    for source, rows in ((arrays(), 57), (frame, 3), (sac.replay_buffer, 60)):
+        assert OfflineDCE.load_dataset(source, **SMALL).learn(1).replay_buffer.size() == rows
+    model = OfflineDCE("MlpPolicy", spaces_env, dataset=sac.replay_buffer, **SMALL)
+    assert model.learn(1).replay_buffer.size() == 60
+    model.set_dataset(sac.replay_buffer)
+    assert model.learn(1).replay_buffer.size() == 60
+    with pytest.raises(ConfigError):
+        model.set_dataset(3.5)  # type: ignore[arg-type]
+
+
+def test_saved_buffer_of_another_algorithm_can_be_loaded(sac: SAC, spaces_env: SpacesEnv, tmp_path: Path) -> None:
+    sac.save_replay_buffer(tmp_path / "buffer.pkl")
+    model = OfflineDCE("MlpPolicy", spaces_env, **SMALL)
+    model.load_replay_buffer(tmp_path / "buffer.pkl")
+    model.learn(2)
+    assert np.allclose(model.replay_buffer.rewards, sac.replay_buffer.rewards[:60])
+    model.replay_buffer = sac.replay_buffer
+    with pytest.raises(ConfigError, match=r"is a ReplayBuffer, .*set_dataset"):
+        model.learn(2)
+
+
+def test_rows_that_are_added_are_said_to_replace_the_dataset() -> None:
+    model = OfflineDCE.load_dataset(TINY, **SMALL)
+    zeros = np.zeros((1, 17))
+    for _ in range(20):
+        model.replay_buffer.add(zeros, zeros, np.zeros((1, 6)), np.zeros(1), np.array([0.0]), [{}])
+    with pytest.warns(DatasetWarning, match=f"20 rows that were added .*{TINY} is not read"):
+        model.learn(1)
+
+
+def test_npz_keeps_the_bounds_of_actions(tmp_path: Path) -> None:
+    data = load_dataset(arrays(scale=2.0), action_low=-2, action_high=[3.0])
+    data.to_npz(tmp_path / "data.npz")
+    info = load_dataset(tmp_path / "data.npz").info
+    assert info.action_space_low.tolist() == [-2.0] and info.action_space_high.tolist() == [3.0]
+    assert load_dataset(tmp_path / "data.npz", action_scale=4.0).info.action_space_high.tolist() == [4.0]
+    plain = load_dataset(arrays())
+    plain.to_npz(tmp_path / "plain.npz")
+    assert load_dataset(tmp_path / "plain.npz").info.action_space_high.tolist() == [1.0]
+
+
+def test_empty_cell_is_nan_if_such_rows_are_dropped(table: Path) -> None:
+    frame = pd.read_csv(table)
+    frame.loc[7, "obs_1"] = np.nan
+    frame.to_csv(table, index=False)
+    whole = load_dataset(frame, drop_nonfinite=True)
+    read = load_dataset(table, drop_nonfinite=True)
+    assert np.array_equal(read.rows, whole.rows) and len(read) == 55
+    with pytest.raises(Exception, match=r"empty cell.*drop_nonfinite=True"):
+        load_dataset(table)
+    frame["terminal"] = frame["terminal"].astype(object)
+    frame.loc[9, "terminal"] = ""
+    frame.to_csv(table, index=False)
+    with pytest.raises(Exception, match=r"line 11, column 'terminal': empty cell. Fill it in$"):
+        load_dataset(table, drop_nonfinite=True)
+
+
+def test_repr_of_transitions_is_a_line() -> None:
+    text = repr(load_dataset(arrays()))
+    assert text == "<Transitions: dataset arrays: 57 transitions from 60 rows, 3 whole episodes>"
+
+
+# -- own classes and messages ------------------------------------------------------------------------------------------
+
+
+class Extended(OfflineDCE):
+    """A user's agent: one more parameter, all others passed on, no hyperparameter file of its own."""
+
+    algo_name = "extended"
+
+    def __init__(self, *args: Any, weight: float = 1.0, sharp: bool = False, **kwargs: Any) -> None:
+        self.weight, self.sharp = weight, sharp
+        super().__init__(*args, **kwargs)
+
+
+def test_subclass_that_passes_its_arguments_on(tmp_path: Path) -> None:
+    model = Extended.load_dataset(TINY, weight=2.0, beta=3.0, beta_final=None, beta_rate=0.0, **SMALL).learn(2)
+    assert model.hyperparameters()["weight"] == 2.0 and model.hyperparameters()["beta"] == 3.0
+    model.save(tmp_path / "model.zip")
+    assert Extended.load(tmp_path / "model.zip", beta=2.0).beta == 2.0
+    with pytest.raises(ConfigError, match=r"no parameter 'wait'. Did you mean 'weight'"):
+        Extended.load_dataset(TINY, wait=1.0)
+    with pytest.raises(ConfigError, match="sharp must be True or False"):
+        Extended.load_dataset(TINY, sharp="no", **SMALL)
+
+
+def test_messages_lead_somewhere(make_point_mass: Callable[[], gym.Env]) -> None:
+    with pytest.raises(ConfigError, match=r"belongs to the reader.*load_dataset\(<file>, action_scale="):
+        OfflineDCE.load_dataset(TINY, action_scale=2.0)
+    with pytest.raises(ConfigError, match="actions of width 6, the model's environment of 2"):
+        OfflineDCE.load_dataset(TINY, env=make_point_mass(), **SMALL).learn(1)
+    with pytest.raises(ConfigError, match=r"SACPolicy does not take .*use_v.*sb3_dce.policies"):
+        OfflineDCE(SACPolicy, dataset=TINY)
+    OfflineSAC(SACPolicy, dataset=TINY, **SMALL).learn(1)
+
+
+# -- logs --------------------------------------------------------------------------------------------------------------
+
+
+def rows_of(folder: Path) -> pd.DataFrame:
+    return pd.read_csv(folder / "progress.csv")
+
+
+def test_diagnostics_are_in_rows_that_a_callback_asks_for(transitions: Transitions, tmp_path: Path) -> None:
+    model = OfflineDCE("MlpPolicy", dataset=transitions, **SMALL)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(10, LogEveryNTimesteps(5), log_interval=None)
+    rows = rows_of(tmp_path)
+    assert rows["time/total_timesteps"].tolist() == [5, 10] and rows["train/q_data"].notna().all()
+
+
+def test_an_evaluation_at_the_interval_of_the_log_makes_one_row(
+    transitions: Transitions, make_point_mass: Callable[[], gym.Env], tmp_path: Path
+) -> None:
+    model = OfflineDCE("MlpPolicy", make_point_mass(), dataset=transitions, **SMALL)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    evaluation = EvalCallback(make_point_mass(), eval_freq=5, n_eval_episodes=1, verbose=0, warn=False)
+    model.learn(10, evaluation, log_interval=5)
+    rows = rows_of(tmp_path)
+    assert rows["time/total_timesteps"].tolist() == [5, 10]
+    assert rows[["train/q_data", "eval/mean_reward", "time/fps"]].notna().all(axis=None)
