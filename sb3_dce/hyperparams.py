@@ -104,7 +104,8 @@ def load_row(algo: str, dataset_id: str | None) -> dict[str, Any]:
     """
     Hyperparameters of an algorithm on a dataset.
 
-    A dataset without a row of its own uses that of the paper's dataset it stands for, else ``default``.
+    A dataset without a row of its own uses that of D4RL's set of the same name, else that of the paper's dataset it stands
+    for, else ``default``.
 
     :param algo: name of an algorithm, e.g. ``dce``
     :param dataset_id: id or alias of the catalogue; ``None`` for data outside it, which get ``default``
@@ -116,11 +117,12 @@ def load_row(algo: str, dataset_id: str | None) -> dict[str, Any]:
     if dataset_id is None:
         return rows["default"]
     spec = catalog.resolve(dataset_id)
-    names = (spec.id, spec.paper_row or spec.id, "default")
+    twins = [spec.id.removesuffix("-sb3") + version for version in ("-v2", "-v1", "-v0")] if spec.generated else []
+    names = (spec.id, *twins, spec.paper_row or spec.id, "default")
     for name in names:
         if name in rows:
             return {**rows[name], "dataset": spec.id}
-    raise ConfigError(f"no row of the name {' or '.join(names)}", where=str(file_of(algo)), hint="Add one.")
+    raise ConfigError(f"no row of the name {' or '.join(dict.fromkeys(names))}", where=str(file_of(algo)), hint="Add one.")
 
 
 def split_row(row: dict[str, Any]) -> SplitRow:

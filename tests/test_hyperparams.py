@@ -142,6 +142,15 @@ def test_dataset_without_a_row_uses_the_row_it_stands_for(name: str, row_of: str
     assert row == source
 
 
+@pytest.mark.parametrize("name", ["halfcheetah-expert", "door-expert"])
+def test_made_dataset_uses_the_row_of_d4rls_set_of_its_name(name: str) -> None:
+    """PBRL has rows for expert data, which the paper has none of."""
+    row = hyperparams.load_row("offline_pbrl", f"{name}-sb3")
+    expected = hyperparams.load_row("offline_pbrl", f"{name}-{'v2' if 'cheetah' in name else 'v1'}")
+    assert row.pop("dataset") == f"{name}-sb3" and expected.pop("dataset") and row == expected
+    assert row["ood_weight"] in (2.0, 0.2)
+
+
 def test_rows_belong_to_the_caller() -> None:
     hyperparams.load_row("dce", "pen-human-v0")["policy_kwargs"]["net_arch"].append(1)
     assert hyperparams.load_row("dce", "pen-human-v0")["policy_kwargs"] == {"net_arch": [256, 256]}

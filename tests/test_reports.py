@@ -378,6 +378,34 @@ def test_loss_is_not_explained_by_changes_that_were_not_run() -> None:
         assert report.tables["changes"].rows[0][-1] == finding
 
 
+def test_change_that_begins_after_the_run_is_none() -> None:
+    experiment = load_experiment("why-dce-loses")
+    # the row of this set changes beta after 50,000 updates: until then a constant one is the same agent
+    known = {"IQL": [60.0], "DCE": [40.0], "beta constant": [55.0]}
+    findings = {}
+    for n_updates in (50_000, 50_001):
+        rows = table_rows(experiment, {CHEETAH: known}, n_updates=n_updates)
+        report = make_report(evidence_of(rows, "why-dce-loses"))
+        findings[n_updates] = report.tables["changes"].rows[0][-1]
+    assert findings == {
+        50_000: "behind IQL by 20.0: no change was run",
+        50_001: "behind IQL by 20.0: beta constant closes 75%",
+    }
+
+
+def test_score_in_the_middle_of_a_run_is_of_its_middle() -> None:
+    experiment = load_experiment("why-dce-loses")
+    for n in (5, 10):  # evaluations at a fifth and at a tenth of the run
+        curve = [float(i + 1) for i in range(n)]
+        parts = [run_rows(experiment, "DCE", CHEETAH, 0, curves={"score": curve}, n_updates=1000)]
+        report = make_report(
+            evidence_of(results.merge([*parts, run_rows(experiment, "IQL", CHEETAH, 0, 99.0)]), "why-dce-loses")
+        )
+        row = report.tables["diagnostics"].rows[0]
+        middle = [x for x, share in zip(curve, np.arange(1, n + 1) / n, strict=True) if 0.4 <= share <= 0.6]
+        assert row[-2:] == (f"{np.mean(middle):.3g}", f"{curve[-1]:.3g}")
+
+
 # -- facts without runs --------------------------------------------------------------------------------------------
 
 
