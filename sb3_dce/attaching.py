@@ -21,7 +21,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_dce import hyperparams
 from sb3_dce.buffers import OfflineReplayBuffer
-from sb3_dce.checks import missing_vec_normalize
+from sb3_dce.checks import is_untouched, vec_normalize_of
 from sb3_dce.data import Transitions, find_file, load_dataset, load_transitions
 from sb3_dce.data.catalog import DatasetSpec, resolve
 from sb3_dce.data.locate import is_path
@@ -74,7 +74,7 @@ class AttachingMixin(OffPolicyAlgorithm):
         """
         if "dataset" in overrides:
             hint = "Give it once, as the first argument; other data of a model: model.set_dataset(...)."
-            raise ConfigError(f"two datasets are given: {name!r} and {overrides['dataset']!r}", key="dataset", hint=hint)
+            raise ConfigError("two datasets are given", key="dataset", hint=hint)
         name = as_dataset(name)
         spec = None if isinstance(name, Transitions) else find_file(name)[1]
         row = hyperparams.load_row(_algo_with_rows(cls), None if spec is None else spec.id)
@@ -261,12 +261,11 @@ class AttachingMixin(OffPolicyAlgorithm):
     def _prepare_vec_normalize(self) -> None:
         """
         Statistics of a ``VecNormalize`` around the environment: loaded ones are used as they are, fresh ones are taken from
-        the data, since no environment is stepped that could teach them. Either way they stay fixed while training.
+        the data, since no environment is stepped that could teach them. Either way they stay fixed while training, and a
+        model goes on with those it was trained with.
         """
-        env = self._vec_normalize_env
+        env = vec_normalize_of(self)
         if env is None:
-            if self.trained_with_vec_normalize:
-                raise missing_vec_normalize(type(self).__name__)
             return
         env.training = False
         if env.norm_obs and self.normalize_obs:
@@ -275,14 +274,16 @@ class AttachingMixin(OffPolicyAlgorithm):
                 key="normalize_obs",
                 hint="Set normalize_obs=False, or VecNormalize(norm_obs=False).",
             )
-        self.trained_with_vec_normalize = env.norm_obs
-        if env.norm_reward and _is_fresh(env.ret_rms):
+        if env.norm_reward and is_untouched(env.ret_rms):
             raise ConfigError(
                 "VecNormalize(norm_reward=True) has no statistics, and offline training cannot collect them",
                 key="norm_reward",
                 hint="Use norm_reward=False, or load statistics with VecNormalize.load.",
             )
-        if env.norm_obs and isinstance(env.obs_rms, RunningMeanStd) and _is_fresh(env.obs_rms):
+        if self.trained_with_vec_normalize or not env.norm_obs:
+            return
+        self.trained_with_vec_normalize = True
+        if isinstance(env.obs_rms, RunningMeanStd) and (is_untouched(env.obs_rms) or env.obs_rms.count < FEWEST_OBSERVATIONS):
             buffer, seen = self._own_buffer(), env.obs_rms.count
             if seen >= 1.0:
                 warnings.warn(
@@ -329,12 +330,6 @@ class AttachingMixin(OffPolicyAlgorithm):
 
 # Running statistics of fewer observations say nothing of a task: a reset or an episode of an untrained policy.
 FEWEST_OBSERVATIONS = 2000
-
-
-def _is_fresh(statistics: RunningMeanStd) -> bool:
-    """Whether running statistics have seen next to nothing and nobody has set them."""
-    untouched = bool(np.all(statistics.mean == 0.0)) and bool(np.all(statistics.var == 1.0))
-    return untouched if statistics.count < 1.0 else statistics.count < FEWEST_OBSERVATIONS
 
 
 def as_dataset(source: Any) -> DatasetLike:

@@ -388,7 +388,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
             storages = self.make_storages()
             assert execution is not None
             if self.verbose >= 1 and execution != "eager":
-                print("Compiling the update, once per run: up to a minute.", flush=True)
+                print("Preparing the update for a long run, once: up to a minute.", flush=True)
             engine = Engine(self.make_update(storages), TrainState(storages), execution, planned_updates)
             if self._engine is not None:
                 engine.metrics = self._engine.metrics

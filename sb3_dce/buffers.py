@@ -38,6 +38,8 @@ class OfflineReplayBuffer(ReplayBuffer):
     :param handle_timeout_termination: keep time limits apart from true ends, must be True
     """
 
+    n_added = 0  # rows since the buffer was made or emptied; on the class, since pickled buffers may be without
+
     def __init__(
         self,
         buffer_size: int,
@@ -73,7 +75,6 @@ class OfflineReplayBuffer(ReplayBuffer):
         self.pos = 0
         self.full = False
         self._device = get_device(device)
-        self.n_added = 0
         self.rows: th.Tensor | None = None
         self._timeouts: np.ndarray | None = None
 

@@ -9,6 +9,8 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dce.errors import ConfigError
 from sb3_dce.hyperparams import constructor_parameters
@@ -154,11 +156,10 @@ def check_policy_kwargs(given: Any, policy_class: type, settings: dict[str, Any]
         if name not in parameters and not takes_all:
             hint = f"It has {', '.join(known)}."
             raise ConfigError(f"{policy_class.__name__} has no parameter {name!r}", where="policy_kwargs", key=name, hint=hint)
-        if name == "features_extractor_class" and name in settings and not issubclass(value, settings[name]):
-            hint = f"Set normalize_obs=False, or derive it from sb3_dce.networks.{settings[name].__name__}."
-            what = (
-                f"normalize_obs=True standardises observations in the features extractor, which {value.__name__} would replace"
-            )
+        if name == "features_extractor_class" and name in settings and not _extends(value, settings[name]):
+            whose, ours = getattr(value, "__name__", value), settings[name].__name__
+            hint = f"Set normalize_obs=False, or derive it from sb3_dce.networks.{ours}."
+            what = f"normalize_obs=True standardises observations in the features extractor, which {whose} would replace"
             raise ConfigError(what, key=name, hint=hint)
         if name in settings and name not in ("net_arch", "features_extractor_class"):
             hint = "It follows from the agent's own parameters: set it there, or leave it out."
@@ -170,6 +171,10 @@ def check_policy_kwargs(given: Any, policy_class: type, settings: dict[str, Any]
             raise ConfigError(f"activation_fn must be a class of torch.nn, got {value!r}", key="activation_fn", hint=hint)
         if name == "n_critics":
             check_number("n_critics", value, 1, integer=True)
+
+
+def _extends(value: Any, base: type) -> bool:
+    return isinstance(value, type) and issubclass(value, base)
 
 
 def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
@@ -192,17 +197,36 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
         raise ConfigError(f"actions must have finite bounds, got {action_space}", key="env", hint=hint)
 
 
-def missing_vec_normalize(name: str) -> ConfigError:
+def is_untouched(statistics: RunningMeanStd) -> bool:
     """
-    :param name: of the agent's class
-    :return: for a model that was trained behind a ``VecNormalize`` and is used without one
+    :param statistics: of a ``VecNormalize``
+    :return: whether they have seen nothing and nobody has set them
     """
-    return ConfigError(
-        "the model was trained behind a VecNormalize and has none now: it would see other observations than it knows",
-        key="env",
-        hint=f"Load it with {name}.load(<model>, env=VecNormalize.load(<statistics>, <environment>)). Statistics that stay in "
-        "the model itself: normalize_obs=True.",
-    )
+    return statistics.count < 1.0 and bool(np.all(statistics.mean == 0.0)) and bool(np.all(statistics.var == 1.0))
+
+
+def _knows_nothing(normalizer: VecNormalize) -> bool:
+    return isinstance(normalizer.obs_rms, RunningMeanStd) and is_untouched(normalizer.obs_rms)
+
+
+def vec_normalize_of(model: Any) -> VecNormalize | None:
+    """
+    What stands between the environment and a model.
+
+    :param model: agent, or anything with ``predict``
+    :return: its ``VecNormalize``, if it has one
+    :raises ConfigError: if it was trained behind one whose statistics are not there
+    """
+    found: VecNormalize | None = getattr(model, "_vec_normalize_env", None)
+    if getattr(model, "trained_with_vec_normalize", False):
+        if found is None or not found.norm_obs or _knows_nothing(found):
+            raise ConfigError(
+                "the model was trained behind a VecNormalize whose statistics are not here: it would see other observations",
+                key="env",
+                hint=f"Load it with {type(model).__name__}.load(<model>, env=VecNormalize.load(<statistics>, <environment>)). "
+                "Statistics that stay in the model itself: normalize_obs=True.",
+            )
+    return found
 
 
 def check_ends_with_evaluation(n_updates: int, eval_freq: int, whose: str = "") -> None:

@@ -145,9 +145,12 @@ def constructor_parameters(cls: type) -> dict[str, inspect.Parameter]:
     """
     found: dict[str, inspect.Parameter] = {}
     for base in cls.__mro__:
-        if "__init__" not in vars(base):
+        init = vars(base).get("__init__")
+        if init is None:
             continue
-        parameters = list(inspect.signature(vars(base)["__init__"]).parameters.values())[1:]
+        if not inspect.isfunction(init):  # a partial method, for example, which only the class itself resolves
+            return found or dict(inspect.signature(cls).parameters)
+        parameters = list(inspect.signature(init).parameters.values())[1:]
         variable = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
         found |= {p.name: p for p in parameters if p.kind not in variable and p.name not in found}
         if not any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters):

@@ -153,6 +153,8 @@ class Population:
     def _bound_engine(self, planned_updates: int) -> Engine[StackedState]:
         if self._engine is None:
             template = _template(self.models[0], self.device)
+            for storage in self._storages[0].values():
+                storage.move_settings(self.device)
             update = template.make_update(self._storages[0])
 
             def together(state: Any, batch: Any, noise: Any, coef: Any, **variant: Any) -> Any:
@@ -266,6 +268,9 @@ def check_alike(models: Sequence[OfflineAlgorithm]) -> None:
     """
     if not models:
         raise ConfigError("a population needs at least one model", key="models", hint="Give a specification for each member.")
+    if any(model.get_vec_normalize_env() is not None for model in models):
+        hint = "Set normalize_obs=True instead, whose statistics stay in each model."
+        raise ConfigError("members of a population cannot have a VecNormalize", key="env", hint=hint)
     first = models[0]
     own = (getattr(base, "population_scalars", ()) for base in type(first).__mro__)
     allowed = SCALARS.union(*own)
@@ -280,10 +285,13 @@ def check_alike(models: Sequence[OfflineAlgorithm]) -> None:
             found = [name for name in mine if name not in allowed and mine[name] != other[name]]
             shapes = [[p.shape for p in m.policy.parameters()] for m in (first, model)]
             names = [set(m.make_storages()) for m in (first, model)]
+            frozen = [[n for n, p in m.policy.named_parameters() if not p.requires_grad] for m in (first, model)]
             if found:
                 differing, theirs, ours = found[0], other[found[0]], mine[found[0]]
             elif shapes[0] != shapes[1]:
                 differing, theirs, ours = "network shapes", model.observation_space, first.observation_space
+            elif frozen[0] != frozen[1]:
+                differing, theirs, ours = "frozen parameters", frozen[1], frozen[0]
             elif names[0] != names[1]:
                 differing, theirs, ours = "learners", sorted(names[1]), sorted(names[0])
             elif model._n_updates != first._n_updates:

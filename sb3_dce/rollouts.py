@@ -16,9 +16,8 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_dce.checks import check_number, missing_vec_normalize
+from sb3_dce.checks import check_number, vec_normalize_of
 from sb3_dce.envs import without_bookkeeping
 from sb3_dce.locomotion import EnvSteps, fast_steps
 from sb3_dce.mlp_actor import MLPActor, actor_snapshot
@@ -167,7 +166,7 @@ def plain_policy(model: Any) -> BasePolicy | None:
     :return: its policy, if ``model.predict`` is the policy's ``predict`` of Stable-Baselines3 and nothing else, on the
         observations of the environment
     """
-    if _vec_normalize_of(model) is not None:
+    if vec_normalize_of(model) is not None:
         return None
     policy: Any = getattr(model, "policy", None)
     own_predict = type(model).predict is not BaseAlgorithm.predict or type(policy).predict is not BasePolicy.predict
@@ -182,25 +181,13 @@ def deterministic_act(model: Any) -> Act:
     :return: function of a batch of observations; the bits are those of ``model.predict(obs, deterministic=True)``. Weights
         that change later need another call
     """
-    policy, normalizer = plain_policy(model), _vec_normalize_of(model)
+    policy, normalizer = plain_policy(model), vec_normalize_of(model)
     if normalizer is not None:
         return lambda obs: model.predict(normalizer.normalize_obs(obs), deterministic=True)[0]
     if policy is None:
         return lambda obs: model.predict(obs, deterministic=True)[0]
     snapshot = actor_snapshot(policy) if policy.device.type == "cpu" else None
     return policy_act(policy) if snapshot is None else MLPActor(snapshot)
-
-
-def _vec_normalize_of(model: Any) -> VecNormalize | None:
-    """
-    What stands between the environment and the model.
-
-    :raises ConfigError: if the model was trained behind a ``VecNormalize`` and has none now
-    """
-    normalizer: VecNormalize | None = getattr(model, "_vec_normalize_env", None)
-    if normalizer is None and getattr(model, "trained_with_vec_normalize", False):
-        raise missing_vec_normalize(type(model).__name__)
-    return normalizer
 
 
 def policy_act(policy: BasePolicy) -> Act:

@@ -25,6 +25,8 @@ DAMAGED = "The file is damaged or something else: give a zip file written by mod
 SelfSaving = TypeVar("SelfSaving", bound="SavingMixin")
 
 # Not in the zip: what is large, what can be made again, and what SB3 would pickle although nothing needs it.
+# Arguments that decide which rows of the data are trained on.
+CHOOSES_ROWS = frozenset({"fraction", "d4rl_compat"})
 EXCLUDED = (
     *("_transitions", "_engine", "_generator", "_coef", "_metrics_read_at"),
     *("_last_obs", "_last_episode_starts", "_last_original_obs", "ep_info_buffer", "ep_success_buffer"),
@@ -35,6 +37,7 @@ class SavingMixin(OffPolicyAlgorithm):
     """What :class:`~sb3_dce.base.OfflineAlgorithm` changes about saving and loading."""
 
     algo_name: ClassVar[str]
+    dataset_statistics: dict[str, Any] | None
     _generator: th.Generator | None
     rng_state: th.Tensor
 
@@ -98,7 +101,8 @@ class SavingMixin(OffPolicyAlgorithm):
         :param custom_objects: replacements of saved attributes
         :param print_system_info: print versions of this machine and of the file
         :param force_reset: kept for Stable-Baselines3
-        :param kwargs: constructor arguments that replace the saved ones
+        :param kwargs: constructor arguments that replace the saved ones. Another ``seed`` begins another random sequence, the
+            saved one goes on
         :return: model
         :raises ConfigError: for an unknown keyword
         :raises CheckpointError: if the file is missing, damaged or another agent's, or its parameters do not fit the
@@ -106,14 +110,17 @@ class SavingMixin(OffPolicyAlgorithm):
         """
         hyperparams.check_keys(cls, kwargs, where=f"{cls.__name__}.load")
         source, dataset = cls._own_file(path), kwargs.pop("dataset", None)
+        saved_seed = _saved_data(source).get("seed")
         try:
             model = super().load(source, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         except (zipfile.BadZipFile, pickle.UnpicklingError, EOFError, RuntimeError) as error:
             raise CheckpointError(
                 f"the model cannot be read: {str(error).splitlines()[0][:200]}", where=_name_of(source), hint=DAMAGED
             ) from error
-        if kwargs.get("seed") is not None:  # the saved state of the generator would go on as if nothing had been asked for
+        if kwargs.get("seed") not in (None, saved_seed):  # the saved state of the generator would go on regardless
             model.set_random_seed(kwargs["seed"])
+        if CHOOSES_ROWS & set(kwargs):
+            model.dataset_statistics = None  # other rows are what was asked for
         if dataset is not None:
             model.set_dataset(dataset)  # type: ignore[attr-defined]  # AttachingMixin has it
         return model
@@ -191,6 +198,12 @@ def saved_algo(path: Path | io.BufferedIOBase) -> str | None:
     :return: name of the agent, ``None`` for a model of another package
     :raises CheckpointError: if it is no saved model
     """
+    algo: str | None = _saved_data(path).get("algo")
+    return algo
+
+
+def _saved_data(path: Path | io.BufferedIOBase) -> dict[str, Any]:
+    """The readable part of a saved model; what is pickled in it stays text."""
     position = path.tell() if isinstance(path, io.IOBase) else 0
     try:
         with zipfile.ZipFile(path) as archive:
@@ -200,7 +213,7 @@ def saved_algo(path: Path | io.BufferedIOBase) -> str | None:
         raise CheckpointError(f"not a saved model ({error})", where=_name_of(path), path=found, hint=DAMAGED) from error
     if isinstance(path, io.IOBase):
         path.seek(position)
-    return saved.get("algo") if isinstance(saved, dict) else None
+    return saved if isinstance(saved, dict) else {}
 
 
 def _name_of(source: Path | io.BufferedIOBase) -> str:

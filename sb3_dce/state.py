@@ -7,6 +7,7 @@ its optimizer. The update reads and writes the vectors; ``state_dict()``, ``pred
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch as th
@@ -143,6 +144,13 @@ class Storage:
             p in state and state[p]["exp_avg"].data_ptr() == address and state[p]["step"] is self.step
             for p, address in zip(self._parameters, self._moment_pointers, strict=True)
         )
+
+    def move_settings(self, device: th.device) -> None:
+        """
+        :param device: where the update runs, if it is not where the parameters lie
+        """
+        if self.settings is not None and self.settings.trained is not None:
+            self.settings = replace(self.settings, trained=self.settings.trained.to(device))
 
     def set_learning_rate(self, learning_rate: float) -> None:
         """

@@ -912,7 +912,7 @@ def test_model_trained_behind_vec_normalize_is_not_used_without(
     env.save(str(tmp_path / "statistics.pkl"))
     loaded = agent.cls.load(tmp_path / "model.zip")
     loaded.set_dataset(transitions)
-    with pytest.raises(ConfigError, match="behind a VecNormalize"):
+    with pytest.raises(ConfigError, match="behind a VecNormalize whose"):
         loaded.learn(1)
     with pytest.raises(ConfigError, match="behind a VecNormalize"):
         evaluate(loaded, rollouts, seed=7)

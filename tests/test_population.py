@@ -6,10 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import test_agents
 import torch as th
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from update_tools import all_tensors, largest_difference, needs_compiler, to_float64
 
 from sb3_dce import OfflineBC, OfflineDCE, Transitions
@@ -59,6 +61,29 @@ def test_members_equal_single_runs(data: list[Transitions]) -> None:
         expected = single.read_metrics()
         expected.pop("sec_per_1000")
         assert metrics == pytest.approx(expected, rel=1e-8, abs=1e-8)
+
+
+def test_frozen_parameters_of_members_stay(data: list[Transitions]) -> None:
+    def frozen(seed: int) -> OfflineAlgorithm:
+        model = make(data[0], seed=seed)
+        model.critic.q_networks[0][0].requires_grad_(False)
+        return model
+
+    singles, members = ([frozen(seed) for seed in range(2)] for _ in range(2))
+    start = [member.critic.q_networks[0][0].weight.detach().clone() for member in members]
+    population = Population(members, own_randomness=True)
+    population.train(5)
+    for single, member, weight in zip(singles, population.commit(), start, strict=True):
+        assert largest_difference(all_tensors(alone(single, 5)), all_tensors(member)) <= 1e-11
+        assert th.equal(member.critic.q_networks[0][0].weight, weight)
+    with pytest.raises(ConfigError, match="frozen parameters"):
+        Population([frozen(0), make(data[0], seed=1)])
+
+
+def test_vec_normalize_is_refused(data: list[Transitions], make_point_mass: Callable[[], gym.Env]) -> None:
+    env = VecNormalize(DummyVecEnv([make_point_mass]), norm_reward=False)
+    with pytest.raises(ConfigError, match="cannot have a VecNormalize"):
+        Population([make(data[0], env=env)])
 
 
 @pytest.mark.parametrize("name", test_agents.AGENTS)

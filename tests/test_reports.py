@@ -247,7 +247,7 @@ def test_claims_on_places_are_not_tested_on_d4rl_and_own_data_together() -> None
     both = ["halfcheetah-random-v2", "halfcheetah-medium-v2", *HALFCHEETAHS[:2]]
     outcomes = []
     for names in (both, HALFCHEETAHS):
-        rows = table_rows(TABLE, {name: scores(DCE=[90.0]) for name in names})
+        rows = table_rows(TABLE, {name: scores(DCE=[90.0, 91.0, 92.0]) for name in names})
         outcomes.append(claim_of(rows, "C4").outcome)
     assert outcomes == [UNTESTED, HELD]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,11 +16,14 @@ import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import EvalCallback, LogEveryNTimesteps
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_dce import OfflineDCE, OfflineSAC, Transitions, load_dataset
+from sb3_dce import OfflineBC, OfflineDCE, OfflineSAC, Transitions, load_dataset
 from sb3_dce.envs import SpacesEnv
 from sb3_dce.errors import ConfigError, DatasetIntegrityError, DatasetWarning
+from sb3_dce.evaluation import EvaluationCallback
+from sb3_dce.rollouts import Rollouts
 
 SMALL: dict[str, Any] = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "execution": "eager"}
 TINY = "halfcheetah-tiny-sb3"
@@ -93,6 +98,49 @@ def test_dataset_given_at_load_counts(table: Path, tmp_path: Path) -> None:
     assert np.allclose(loaded.replay_buffer.rewards[:, 0], data.rewards)
 
 
+def test_rows_asked_for_at_load_are_trained_on(tmp_path: Path) -> None:
+    OfflineBC.load_dataset(TINY, **SMALL).learn(2).save(tmp_path / "model.zip")
+    loaded = OfflineBC.load(tmp_path / "model.zip", fraction=0.5).learn(1)
+    assert 0 < loaded.replay_buffer.size() < 4000
+
+
+def test_saved_seed_at_load_goes_on(tmp_path: Path) -> None:
+    model = OfflineDCE.load_dataset(TINY, seed=3, **SMALL).learn(2)
+    model.save(tmp_path / "model.zip")
+    straight = model.learn(2, reset_num_timesteps=False)
+    loaded = OfflineDCE.load(tmp_path / "model.zip", seed=3).learn(2, reset_num_timesteps=False)
+    assert th.equal(flat(straight), flat(loaded))
+
+
+def test_model_goes_on_with_the_statistics_it_was_trained_with(
+    make_point_mass: Callable[[], gym.Env], transitions: Transitions, tmp_path: Path
+) -> None:
+    def wrapped(**settings: Any) -> VecNormalize:
+        return VecNormalize(DummyVecEnv([make_point_mass]), norm_reward=False, **settings)
+
+    env = wrapped()
+    model = OfflineDCE("MlpPolicy", env, dataset=transitions, **SMALL).learn(2)
+    mean = env.obs_rms.mean.copy()
+    assert env.obs_rms.count < 2000, "few enough to be taken for a reset"
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DatasetWarning)
+        model.learn(2)
+    model.save(tmp_path / "model.zip")
+    env.save(str(tmp_path / "statistics.pkl"))
+    loaded = OfflineDCE.load(tmp_path / "model.zip", env=VecNormalize.load(str(tmp_path / "statistics.pkl"), wrapped().venv))
+    other = Transitions.from_arrays(
+        transitions.observations + 1.0, transitions.actions, transitions.rewards, transitions.terminals, transitions.timeouts
+    )
+    loaded.set_dataset(other)
+    loaded.learn(2)
+    assert np.array_equal(loaded.get_vec_normalize_env().obs_rms.mean, mean)
+    for fresh in (wrapped(), wrapped(norm_obs=False)):
+        wrong = OfflineDCE.load(tmp_path / "model.zip", env=fresh)
+        wrong.set_dataset(transitions)
+        with pytest.raises(ConfigError, match="whose statistics are not here"):
+            wrong.learn(1)
+
+
 # -- what counts as data -----------------------------------------------------------------------------------------------
 
 
@@ -117,6 +165,15 @@ def test_saved_buffer_of_another_algorithm_can_be_loaded(sac: SAC, spaces_env: S
     model.replay_buffer = sac.replay_buffer
     with pytest.raises(ConfigError, match=r"is a ReplayBuffer, .*set_dataset"):
         model.learn(2)
+
+
+def test_buffer_saved_by_an_earlier_version(tmp_path: Path) -> None:
+    source = OfflineDCE.load_dataset(TINY, **SMALL).learn(1)
+    vars(source.replay_buffer).pop("n_added", None)
+    source.save_replay_buffer(tmp_path / "buffer.pkl")
+    model = OfflineDCE.load_dataset(TINY, **SMALL)
+    model.load_replay_buffer(tmp_path / "buffer.pkl")
+    assert model.learn(1).replay_buffer.size() == source.replay_buffer.size()
 
 
 def test_rows_that_are_added_are_said_to_replace_the_dataset() -> None:
@@ -184,6 +241,13 @@ def test_subclass_that_passes_its_arguments_on(tmp_path: Path) -> None:
         Extended.load_dataset(TINY, sharp="no", **SMALL)
 
 
+def test_constructor_that_is_a_partial_method() -> None:
+    class Fixed(OfflineDCE):
+        __init__ = functools.partialmethod(OfflineDCE.__init__, policy_update_freq=2)  # type: ignore[assignment]
+
+    assert Fixed.load_dataset(TINY, tau=0.01, **SMALL).learn(1).policy_update_freq == 2
+
+
 def test_messages_lead_somewhere(make_point_mass: Callable[[], gym.Env]) -> None:
     with pytest.raises(ConfigError, match=r"belongs to the reader.*load_dataset\(<file>, action_scale="):
         OfflineDCE.load_dataset(TINY, action_scale=2.0)
@@ -217,5 +281,11 @@ def test_an_evaluation_at_the_interval_of_the_log_makes_one_row(
     evaluation = EvalCallback(make_point_mass(), eval_freq=5, n_eval_episodes=1, verbose=0, warn=False)
     model.learn(10, evaluation, log_interval=5)
     rows = rows_of(tmp_path)
+    assert rows["time/total_timesteps"].tolist() == [5, 10]
+    assert rows[["train/q_data", "eval/mean_reward", "time/fps"]].notna().all(axis=None)
+    own = OfflineDCE("MlpPolicy", dataset=transitions, **SMALL)
+    own.set_logger(configure(str(tmp_path / "own"), ["csv"]))
+    own.learn(10, EvaluationCallback(Rollouts(make_point_mass, 1), None, eval_freq=5), log_interval=5)
+    rows = rows_of(tmp_path / "own")
     assert rows["time/total_timesteps"].tolist() == [5, 10]
     assert rows[["train/q_data", "eval/mean_reward", "time/fps"]].notna().all(axis=None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 from result_rows import run_rows, table_rows
@@ -12,7 +13,7 @@ from sb3_dce.experiments import results
 from sb3_dce.experiments.claims import claim_table
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import load_experiment
-from sb3_dce.experiments.judging import CLOSE, HELD, NOT_HELD, UNTESTED
+from sb3_dce.experiments.judging import CLOSE, HELD, NOT_HELD, UNTESTED, standard_error
 from sb3_dce.experiments.reports import reproduction
 from sb3_dce.experiments.verdicts import verdicts
 from sb3_dce.theory import shift_factor
@@ -183,6 +184,46 @@ def test_a_score_within_the_papers_deviation_is_reproduced() -> None:
     table = load_experiment("table1")  # the paper: 75.9 ± 12.3
     rows = table_rows(table, {"hopper-medium-v2": {"DCE": [65.0, 66.0]}}, n_updates=1_000_000)
     assert reproduction(Evidence(table, rows, table.scales["full"])).numbers.startswith("1 of 1 rows")
+
+
+def lost(name: str, variant: str, data: str = CHEETAH) -> pd.DataFrame:
+    """A run that diverged before anything was evaluated."""
+    row = run_rows(load_experiment(name), variant, data, 0).iloc[:1]
+    return row.assign(metric="diverged", step=500, value=1.0)
+
+
+def test_an_agent_that_diverges_has_failed() -> None:
+    sac = lost("fig-beta", "SAC without V")
+    works = scored("fig-beta", {CHEETAH: {"beta 0": 40}})
+    assert one_of(outcomes("fig-beta", results.merge([works, sac])), "better than SAC without V") == HELD
+    both = results.merge([lost("fig-beta", "beta 0"), sac])
+    assert one_of(outcomes("fig-beta", both), "better than SAC without V") == UNTESTED
+    table, names = load_experiment("table1"), [f"halfcheetah-{k}-sb3" for k in ("random", "medium", "medium-replay")]
+    agents = {v.name: [40.0] for v in table.variants}
+    parts = [table_rows(table, {name: {**agents, "DCE": [90.0]} for name in names})]
+    parts += [lost("table1", "DCE", "halfcheetah-medium-expert-sb3"), lost("table1", "BC", "halfcheetah-medium-expert-sb3")]
+    assert one_of(outcomes("table1", results.merge(parts)), "C4") == NOT_HELD
+
+
+def test_q_of_sac_that_diverged_is_compared_with_runs_that_are_there() -> None:
+    sac = lost("fig-sac", "SAC, alpha 1")
+    assert one_of(outcomes("fig-sac", sac), "far lower (paper: 4000 and 400), alpha 1") == UNTESTED
+    with_v = scored("fig-sac", {CHEETAH: {"SAC with V, alpha 1": 60}}, "q_data")
+    assert one_of(outcomes("fig-sac", results.merge([sac, with_v])), "far lower (paper: 4000 and 400), alpha 1") == HELD
+
+
+def test_first_by_a_hair_is_not_best() -> None:
+    table = load_experiment("table1")
+    names = [f"halfcheetah-{kind}-sb3" for kind in ("random", "medium", "medium-replay", "medium-expert")]
+    for dce, outcome in ((40.1, CLOSE), (60.0, HELD), (20.0, NOT_HELD)):
+        rows = table_rows(table, {name: {**{v.name: [40.0] for v in table.variants}, "DCE": [dce]} for name in names})
+        assert one_of(outcomes("table1", rows), "C4") == outcome
+
+
+def test_two_seeds_that_disagree_are_not_taken_for_sure() -> None:
+    assert standard_error(np.array([10.0, 70.0])) == pytest.approx(30.0)
+    assert standard_error(np.array([40.0, 40.0])) == pytest.approx(4.2 / np.sqrt(2))
+    assert standard_error(np.array([40.0])) == 4.2 and standard_error(np.array([1.0, 1.0, 1.0])) == 0.0
 
 
 @pytest.mark.parametrize(("alphas", "outcome"), [((0.2, 0.3, 0.5, 0.25), HELD), ((0.2, 0.3, 0.35, 0.25), NOT_HELD)])

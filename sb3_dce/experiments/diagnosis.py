@@ -10,6 +10,7 @@ import numpy as np
 
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import Variant, settings_in_force
+from sb3_dce.experiments.judging import CLEARLY, differs, standard_error
 from sb3_dce.experiments.tables import TextTable
 from sb3_dce.schedules import StepSchedule
 
@@ -42,8 +43,9 @@ def variant_table(evidence: Evidence) -> TextTable:
     header = ("data", *(v.name for v in variants), "finding")
     note = (
         f"Each column after DCE changes one thing of the paper's row. A change is named as a cause if it closes at least "
-        f"{SHARE:.0%} of the distance between DCE and the better of BC and IQL; one that is none over the length of the runs "
-        "(a constant beta, before the first change of the row's schedule) differs by rounding alone and is not counted."
+        f"{SHARE:.0%} of the distance between DCE and the better of BC and IQL, and is clearly better ({CLEARLY}). One that "
+        "is none over the length of the runs (a constant beta, before the first change of the row's schedule) differs by "
+        "rounding alone and is not counted."
     )
     return TextTable(header, tuple(rows), f"{evidence.caption([n for _, n in evidence.table_rows()])} {note}")
 
@@ -97,8 +99,12 @@ def verdict_of(evidence: Evidence, dataset_id: str) -> str:
     gap = rivals[best] - dce
     changes = [v for v in experiment.variants if v.algo == variant.algo and not _is_same(evidence, v, variant, dataset_id)]
     changed = {v.name: score for v in changes if (score := scores[v.name]) is not None}
-    for name, score in changed.items():
-        if score - dce >= SHARE * gap:
+    own = evidence.last(variant, dataset_id)
+    for v in changes:
+        name, score = v.name, changed.get(v.name)
+        if score is None or score - dce < SHARE * gap:
+            continue
+        if differs(score - dce, standard_error(evidence.last(v, dataset_id)), standard_error(own)) is True:
             causes.append(f"{name} closes {(score - dce) / gap:.0%}")
     half, end = halves(evidence, variant, dataset_id)
     if half is not None and end is not None and end - half >= SHARE * gap:
@@ -114,8 +120,8 @@ def _is_same(evidence: Evidence, one: Variant, other: Variant, dataset_id: str) 
     for each in settings:
         every = each.pop("beta_update_every") * each.pop("steps_per_epoch")
         schedules.append(StepSchedule(each.pop("beta"), each.pop("beta_final"), each.pop("beta_rate"), every))
-    steps = range(0, evidence.n_updates(dataset_id) or 1, min(schedule.every for schedule in schedules))
-    return settings[0] == settings[1] and all(schedules[0].value(n) == schedules[1].value(n) for n in steps)
+    n_updates = evidence.n_updates(dataset_id) or 1
+    return settings[0] == settings[1] and schedules[0].changes(n_updates) == schedules[1].changes(n_updates)
 
 
 def lowest_margin(evidence: Evidence, variant: Variant, dataset_id: str) -> float | None:

@@ -179,7 +179,7 @@ def _panel(evidence: Evidence, panel: Panel, axes: Axes) -> None:
     axes.grid(alpha=0.3)
     if curves:
         for name in _missing(evidence, panel, curves):
-            axes.plot([], [], linestyle="none", label=f"{name}: not run")
+            axes.plot([], [], linestyle="none", label=f"{name}: no curve")
         axes.legend(fontsize=7, framealpha=0.6)
     else:
         axes.set(xticks=[], yticks=[])

@@ -6,6 +6,7 @@ From numbers to outcomes: what a claim is tested with, and when two scores are t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -22,8 +23,8 @@ TENTH = "means over the last tenth of the run"
 # halfcheetah-medium-sb3, five seeds (docs/results/halfcheetah-medium-sb3.md).
 SEED_STD = 4.2
 CLEARLY = (
-    f"clearly: by more than two standard errors over seeds, with a standard deviation of {SEED_STD:g} (measured for DCE) "
-    "where there are fewer than three seeds"
+    f"clearly: by more than two standard errors over seeds, with a standard deviation of at least {SEED_STD:g} (measured for "
+    "DCE on HalfCheetah) where there are fewer than three seeds"
 )
 
 
@@ -76,7 +77,8 @@ class Values(dict[str, float]):
         :param digits: behind the point
         :return: names, numbers and scope; empty without numbers
         """
-        numbers = ", ".join(f"{name}: {value:.{digits}f}" for name, value in self.items())
+        shown = {name: f"{value:.{digits}f}" if math.isfinite(value) else "diverged" for name, value in self.items()}
+        numbers = ", ".join(f"{name}: {value}" for name, value in shown.items())
         return f"{numbers} ({self.scope})" if numbers and self.scope else numbers
 
 
@@ -86,7 +88,8 @@ def values_of(evidence: Evidence, names: list[str], metric: str, dataset: str | 
     :param names: of variants
     :param metric: name
     :param dataset: D4RL id; ``None`` for the grid's first
-    :return: value of each variant at the end of its runs: mean of the last tenth, over seeds; ``None`` if one is missing
+    :return: value of each variant at the end of its runs: mean of the last tenth, over seeds; of scores minus infinity if
+        all diverged; ``None`` if one is missing
     """
     dataset_id = evidence.id_of(dataset)
     if dataset_id is None:
@@ -95,6 +98,8 @@ def values_of(evidence: Evidence, names: list[str], metric: str, dataset: str | 
     variants = [evidence.experiment.variant(name) for name in names]
     for variant in variants:
         value = evidence.tail(variant, dataset_id, metric)
+        if value is None and metric == "score" and all_diverged(evidence, variant, dataset_id):
+            value = -math.inf
         if value is None:
             return None
         values[variant.name] = value
@@ -107,10 +112,11 @@ def values_of(evidence: Evidence, names: list[str], metric: str, dataset: str | 
 def standard_error(scores: np.ndarray) -> float:
     """
     :param scores: of one agent, one per seed
-    :return: standard error of their mean, with ``SEED_STD`` where fewer than three seeds say little on it
+    :return: standard error of their mean, from ``SEED_STD`` up where fewer than three seeds say little on it
     """
     n = max(1, len(scores))
-    return (sample_std(scores) if n > 2 else SEED_STD) / float(np.sqrt(n))
+    spread = sample_std(scores) if n > 2 else max(SEED_STD, sample_std(scores)) if n == 2 else SEED_STD
+    return spread / float(np.sqrt(n))
 
 
 def above(values: Values | None, first: str, second: str) -> bool | str | None:
@@ -120,7 +126,7 @@ def above(values: Values | None, first: str, second: str) -> bool | str | None:
     :param second: name
     :return: whether the first is above the second, ``CLOSE`` if seeds alone could have made the difference
     """
-    if values is None:
+    if values is None or values[first] == values[second] == -math.inf:
         return None
     return differs(values[first] - values[second], values.errors[first], values.errors[second])
 
@@ -213,13 +219,13 @@ def on_this_kind(claim: str, rule: str, holds: bool | str | None, values: Values
     return judge(claim, rule, None, f"{values.other_kind}: {text}")
 
 
-def all_diverged(evidence: Evidence, name: str) -> bool:
+def all_diverged(evidence: Evidence, variant: Variant, dataset_id: str | None) -> bool:
     """
     :param evidence: rows
-    :param name: of a variant
-    :return: whether every run of it on the grid's first data was lost
+    :param variant: agent
+    :param dataset_id: data, ``None`` without any
+    :return: whether every run of it was lost
     """
-    dataset_id, variant = evidence.id_of(None), evidence.experiment.variant(name)
     if dataset_id is None:
         return False
     n_runs = evidence.runs(variant, dataset_id)["seed"].nunique()

@@ -185,6 +185,8 @@ def common_rows(evidence: Evidence, part: str) -> list[str]:
     """
     ids = _rows_of_part(evidence, part)
     variants = [v for v in evidence.experiment.variants if v.paper is not None and _has_any(evidence, v, ids)]
+    if not variants:
+        return []
     return [name for name in ids if all(len(evidence.last(v, name)) for v in variants)]
 
 

@@ -7,6 +7,7 @@ ablation and beside the bounds) is judged at one of them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -259,16 +260,21 @@ def _cql_return(evidence: Evidence) -> list[Verdict]:
     return found
 
 
+def _lost(evidence: Evidence, name: str) -> bool:
+    """Whether all runs of a variant on the grid's first data diverged."""
+    return all_diverged(evidence, evidence.experiment.variant(name), evidence.id_of(None))
+
+
 def _sac(evidence: Evidence) -> list[Verdict]:
-    found = []
+    found, data = [], evidence.id_of(None)
     for alpha in ("alpha 1", "alpha auto"):
         names = [f"SAC, {alpha}", f"SAC with V, {alpha}"]
         q_values = values_of(evidence, names, "q_data")
         lower = None
         if q_values is not None and q_values[names[0]] > 0:
             lower = q_values[names[1]] < 0.5 * q_values[names[0]]
-        elif all_diverged(evidence, names[0]):
-            lower = not all_diverged(evidence, names[1])
+        elif _lost(evidence, names[0]) and evidence.curve(evidence.experiment.variant(names[1]), data or "", "q_data").size:
+            lower = not _lost(evidence, names[1])
         rule = f"Q of SAC with V below half of that of SAC, or SAC diverges and this does not ({TENTH})"
         claim = f"V alone makes Q far lower (paper: 4000 and 400), {alpha}"
         found.append(judge(claim, rule, lower, text_of(q_values)))
@@ -308,7 +314,7 @@ def _alpha_return(evidence: Evidence) -> list[Verdict]:
     outcome: bool | None = None
     if works is not None and works["DCE, alpha 1"] > WORKING:
         dce_works = works["DCE, alpha 5"] >= max(WORKING, 0.5 * works["DCE, alpha 1"])
-        if all_diverged(evidence, "Eq. 18, alpha 5"):
+        if _lost(evidence, "Eq. 18, alpha 5"):
             outcome = dce_works
         elif fails is not None and fails["Eq. 18, alpha 1"] > WORKING:
             outcome = dce_works and fails["Eq. 18, alpha 5"] < 0.5 * fails["Eq. 18, alpha 1"]
@@ -368,13 +374,15 @@ def _leading(evidence: Evidence) -> list[Verdict]:
         wanted = [d for d in evidence.experiment.datasets if _is_of_kind(d.paper, task, endings)]
         by_source: dict[str, list[str]] = {"D4RL": [], "sb3": []}
         for dataset, name in evidence.table_rows():
-            if dataset in wanted and len(evidence.last(dce, name)):
+            if dataset in wanted and (len(evidence.last(dce, name)) or all_diverged(evidence, dce, name)):
                 by_source[source_of(name)].append(name)
         # the paper's own data if they are all there; never some of these and some of ours
         ids = by_source["D4RL"] if len(by_source["D4RL"]) >= len(by_source["sb3"]) else by_source["sb3"]
         scores = {name: {v.name: evidence.last(v, name) for v in agents} for name in ids}
+        means = {name: {agent: float(s.mean()) for agent, s in of.items() if len(s)} for name, of in scores.items()}
         places = {
-            name: 1 + sum(bool(len(s)) and s.mean() > of["DCE"].mean() for s in of.values()) for name, of in scores.items()
+            name: 1 + sum(mean > of.get("DCE", -math.inf) for agent, mean in of.items() if agent != "DCE")
+            for name, of in means.items()
         }
         complete = all(len(s) for of in scores.values() for s in of.values())
         one_length = len({evidence.n_updates(name) for name in ids}) == 1
@@ -388,10 +396,10 @@ def _leading(evidence: Evidence) -> list[Verdict]:
             # missing agents and data can only add to those that are ahead
             holds = False if any(map(_is_clearly_behind, scores.values())) else None
             if holds is None and everything:
-                holds = True if all(place == 1 for place in places.values()) else CLOSE
+                holds = True if all(map(_is_clearly_ahead, scores.values())) else CLOSE
             rule = (
-                "held: DCE's mean is the highest of all the paper's agents on every such set, at one length; did not hold: on "
-                f"one of the sets an agent is clearly above it ({CLEARLY})"
+                "held: DCE is clearly above all the paper's agents on every such set, at one length; did not hold: on one of "
+                f"the sets an agent is clearly above it, or it diverged ({CLEARLY})"
             )
         absent = sorted({name for of in scores.values() for name, s in of.items() if not len(s)})
         numbers = ", ".join(f"{name}: {place} ({evidence.scope(name, agents)})" for name, place in places.items())
@@ -401,9 +409,19 @@ def _leading(evidence: Evidence) -> list[Verdict]:
 
 
 def _is_clearly_behind(scores: dict[str, np.ndarray]) -> bool:
-    """Whether an agent's mean is above that of DCE by more than seeds could do."""
-    own, error = scores["DCE"].mean(), standard_error(scores["DCE"])
-    return any(differs(float(s.mean() - own), standard_error(s), error) is True for s in scores.values() if len(s))
+    """Whether an agent's mean is above that of DCE by more than seeds could do; a DCE that diverged has no score."""
+    own = scores["DCE"]
+    return not len(own) or any(
+        differs(float(s.mean() - own.mean()), standard_error(s), standard_error(own)) is True
+        for s in scores.values()
+        if len(s)
+    )
+
+
+def _is_clearly_ahead(scores: dict[str, np.ndarray]) -> bool:
+    own = scores["DCE"]
+    others = [s for name, s in scores.items() if name != "DCE"]
+    return all(differs(float(own.mean() - s.mean()), standard_error(own), standard_error(s)) is True for s in others)
 
 
 def _leads_by_more_than_chance(scores: dict[str, np.ndarray]) -> bool:
