@@ -42,7 +42,7 @@ MANNER_NAME = "DCE in Stable-Baselines3's manner"
 TURN_SECONDS = 0.7
 # What is compiled is what a run of this many updates would compile.
 LONG_RUN = 1_000_000
-# A turn in which the process waited for the core is thrown away.
+# A turn in which the process waited for the core is counted in the report; its processor time is what counts.
 MAX_WALL_PER_CPU = 1.05
 # Multiply-adds of one DCE update per row of the batch, 256-256 networks (sum over its matrix products).
 DCE_MACS = 1_748_736

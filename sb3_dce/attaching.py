@@ -232,6 +232,9 @@ class AttachingMixin(OffPolicyAlgorithm):
                 where=self.dataset,
                 hint="Read the data as before and give them to model.set_dataset(...); it also takes other data.",
             )
+        if buffer.size() < self.batch_size:
+            text = f"{buffer.size():,} rows for batches of {self.batch_size}: every batch draws most of them, some twice"
+            warnings.warn(text, DatasetWarning)
         for text in self.check_dataset_fits(self._mean_reward(), info.n_terminals):
             warnings.warn(text, DatasetWarning)
         if self.normalize_obs:

@@ -42,6 +42,7 @@ from sb3_dce.hyperparams import constructor_parameters
 from sb3_dce.networks import StandardizedExtractor
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.precision import PRECISIONS, matmul_precision
+from sb3_dce.processes import UninterruptedBlock
 from sb3_dce.saving import SavingMixin
 from sb3_dce.state import Storage, TrainState
 
@@ -165,6 +166,8 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
     # Networks of the policy by attribute name. Each becomes an attribute of the agent and a storage of the update; those
     # with an ``optimizer`` are trained, the others are targets or frozen.
     networks: ClassVar[tuple[str, ...]]
+    # Length of the run that these updates belong to, where it is known: what is resumed is executed as it was begun.
+    planned_updates: int | None = None
     # Parameters of the subclass in which the members of a population may differ, since they reach the update as numbers.
     population_scalars: ClassVar[frozenset[str]] = frozenset()
 
@@ -348,7 +351,8 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         buffer = self.replay_buffer
         assert isinstance(buffer, OfflineReplayBuffer)
         self.policy.set_training_mode(True)  # evaluation leaves the policy in evaluation mode
-        engine = self._bound_engine(max(self._total_timesteps - self.num_timesteps, gradient_steps))
+        planned = max(self._total_timesteps - self.num_timesteps, gradient_steps)
+        engine = self._bound_engine(self.planned_updates or planned)
         generator, specs = self._training_generator(), self.noise_specs(batch_size)
         dtype = next(self.policy.parameters()).dtype
         rates = self.learning_rates()
@@ -368,11 +372,12 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         on_device = None if self._vec_normalize_env is not None else generator
         with matmul_precision(self.precision, self.device):
             for _ in range(gradient_steps):
-                coef, variant = self._coefficient_tensors(dtype), self.update_variant(self._n_updates)
-                engine.step_drawn(draw, coef, on_device, source, **variant)
-                self._n_updates += 1
-                if self.reads_state_after(self._n_updates):
-                    self.read_state(engine.state.read())
+                with UninterruptedBlock():  # the networks of an update are written one after the other
+                    coef, variant = self._coefficient_tensors(dtype), self.update_variant(self._n_updates)
+                    engine.step_drawn(draw, coef, on_device, source, **variant)
+                    self._n_updates += 1
+                    if self.reads_state_after(self._n_updates):
+                        self.read_state(engine.state.read())
 
     def _bound_engine(self, planned_updates: int) -> Engine[TrainState]:
         """
@@ -440,7 +445,12 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         while keep_going and self.num_timesteps < total_timesteps:
             chunk = min(self.gradient_steps, total_timesteps - self.num_timesteps)
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
-            self.train(gradient_steps=chunk, batch_size=self.batch_size)
+            before = self._n_updates
+            try:
+                self.train(gradient_steps=chunk, batch_size=self.batch_size)
+            except KeyboardInterrupt:
+                self.num_timesteps += self._n_updates - before  # what is saved now can go on
+                raise
             keep_going = self._count_steps(chunk, callback, log_interval)
         self._refuse_divergence()  # a run may be shorter than the intervals of the log
         callback.on_training_end()

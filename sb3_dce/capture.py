@@ -27,7 +27,12 @@ class CaptureError(SB3DCEError, RuntimeError):
 
 
 class StaticInputs(NamedTuple):
-    """Buffers that a captured step reads: each call copies its batch and noise there."""
+    """
+    Buffers that a captured step reads: each call copies its batch and noise there.
+
+    :param batch: replay data, tensors of shape (..., batch, width)
+    :param noise: random numbers by name
+    """
 
     batch: Any
     noise: dict[str, th.Tensor]

@@ -67,7 +67,8 @@ def check_choice(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
     :raises ConfigError: if the value is none of them
     """
     if value not in allowed:
-        raise ConfigError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}", key=name)
+        what = f"{name} must be one of {', '.join(map(repr, allowed))}, got {value!r}"
+        raise ConfigError(what, key=name, hint="Give one of them, or leave it out for the default.")
 
 
 def check_flags(owner: object) -> None:
@@ -79,7 +80,7 @@ def check_flags(owner: object) -> None:
     for name, parameter in constructor_parameters(type(owner)).items():
         value = getattr(owner, name, False)  # not every argument is kept
         if parameter.annotation == "bool" and not isinstance(value, (bool, np.bool_)):
-            raise ConfigError(f"{name} must be True or False, got {value!r}", key=name)
+            raise ConfigError(f"{name} must be True or False, got {value!r}", key=name, hint="Without quotation marks.")
 
 
 def check_seed(seed: Any) -> None:

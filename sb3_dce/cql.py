@@ -299,7 +299,7 @@ def update(
         q_all = critic(params, states, actions)
         q_data, q_sampled = q_all[..., :n, :], _of_actions(q_all[..., n:, :], len(sampled))
         gaps = losses.cql_gap(q_data, q_sampled, log_densities)
-        td = losses.batch_mean((q_data - y).square())
+        td = losses.mean_square(q_data, y)
         return (td + _penalties(options, gaps, multiplier, coef)).sum(), (q_data, q_sampled, gaps)
 
     clip = options.max_grad_norm

@@ -141,7 +141,13 @@ def make_env_if_possible(dataset_id: str) -> gym.Env:
 
 
 class MissingSimulator(NamedTuple):
-    """Why a policy cannot be evaluated here, and what to do; ``package`` is what could be installed, if anything."""
+    """
+    Why a policy cannot be evaluated here, and what to do.
+
+    :param reason: in words
+    :param remedy: in words
+    :param package: what could be installed, ``None`` if nothing
+    """
 
     reason: str
     remedy: str

@@ -83,10 +83,6 @@ class CheckpointError(SB3DCEError):
     """A saved model is damaged, incomplete or belongs to something else, or cannot be written."""
 
 
-class UnsafeFileError(SB3DCEError):
-    """A file would need code execution, or breaks a limit."""
-
-
 class DivergenceError(SB3DCEError, ValueError):
     """Training produced a value that is not finite. A ``ValueError``, so that hyperparameter searches prune the trial."""
 

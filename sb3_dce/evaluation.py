@@ -21,7 +21,7 @@ from sb3_dce.data.minari import is_minari_name
 from sb3_dce.envs import make_env_if_possible, make_minari_env, missing_simulator
 from sb3_dce.errors import CheckpointError, DatasetError
 from sb3_dce.evaluation_pool import EvaluationPool
-from sb3_dce.files import write_atomically
+from sb3_dce.files import check_writable, write_atomically
 from sb3_dce.rollouts import Rollouts, deterministic_act
 
 # Seeds of two evaluations must not overlap; no evaluation has more episodes than this.
@@ -180,6 +180,10 @@ class EvaluationCallback(BaseCallback):
         self.save_checkpoint = save_checkpoint
         self.pool = EvaluationPool(n_workers)
         self.evaluations: list[Evaluation] = [] if folder is None else read_evaluations(folder, dataset_id)
+
+    def _on_training_start(self) -> None:
+        if self.folder is not None:
+            check_writable(self.folder / "evaluations.npz")  # not hours later
 
     def _on_step(self) -> bool:
         if self.num_timesteps % self.eval_freq == 0:

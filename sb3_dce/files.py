@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import glob
 import os
 import pathlib
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import BinaryIO
@@ -23,7 +26,9 @@ def write_atomically(target: pathlib.Path) -> Iterator[BinaryIO]:
     temporary: str | None = None
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, temporary = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".tmp", dir=target.parent)
+        _remove_abandoned(target)
+        prefix = f".{target.name}.{os.getpid()}."
+        descriptor, temporary = tempfile.mkstemp(prefix=prefix, suffix=".tmp", dir=target.parent)
         with os.fdopen(descriptor, "w+b") as stream:
             yield stream
             stream.flush()
@@ -31,11 +36,47 @@ def write_atomically(target: pathlib.Path) -> Iterator[BinaryIO]:
         os.chmod(temporary, 0o666 & ~_umask())  # mkstemp makes private files
         os.replace(temporary, target)
         temporary = None
+        _sync_folder(target.parent)
     except OSError as error:
         raise _cannot_write(target, error) from error
     finally:
         if temporary is not None and os.path.exists(temporary):
             os.unlink(temporary)
+
+
+# Younger files may be those of a process on another machine.
+ABANDONED_SECONDS = 600.0
+
+
+def _remove_abandoned(target: pathlib.Path) -> None:
+    """What processes that were killed while they wrote this file have left."""
+    for path in target.parent.glob(f".{glob.escape(target.name)}.*.tmp"):
+        pid = path.name.removeprefix(f".{target.name}.").partition(".")[0]
+        with contextlib.suppress(OSError):
+            if pid.isdecimal() and not _lives(int(pid)) and time.time() - path.stat().st_mtime > ABANDONED_SECONDS:
+                path.unlink()
+
+
+def _lives(pid: int) -> bool:
+    if os.name == "nt":  # os.kill would end it
+        return True
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:
+        pass
+    return True
+
+
+def _sync_folder(folder: pathlib.Path) -> None:
+    """So that the new name survives a power cut, too; not every system can."""
+    with contextlib.suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def check_writable(target: pathlib.Path) -> None:

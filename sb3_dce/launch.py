@@ -20,7 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from sb3_dce import runs
 from sb3_dce.errors import DivergenceError, SB3DCEError
 from sb3_dce.evaluation import Evaluation
-from sb3_dce.processes import prepare_worker
+from sb3_dce.processes import prepare_worker, threads_from_environment
 from sb3_dce.runs import RunSpec
 
 # With more runs than this the bars of those that are done make room for the others.
@@ -71,7 +71,7 @@ def _killed() -> RunFailedError:
 def _launch(specs: Sequence[RunSpec], workers: int, console: Console, keep_going: bool) -> list[Future[Any]]:
     workers = max(1, min(workers, len(specs)))
     # The user's own setting wins: more threads than free cores make PyTorch many times slower.
-    threads = int(os.environ.get("OMP_NUM_THREADS", 0)) or max(1, (os.cpu_count() or 1) // workers)
+    threads = threads_from_environment() or max(1, (os.cpu_count() or 1) // workers)
     context = mp.get_context("spawn")
     events = context.Queue()
     with progress_display(console) as display:

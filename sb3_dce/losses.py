@@ -66,6 +66,17 @@ def td_target(rewards: th.Tensor, dones: th.Tensor, next_values: th.Tensor, gamm
     return rewards + gamma * (1.0 - dones) * next_values
 
 
+def mean_square(values: th.Tensor, targets: th.Tensor) -> th.Tensor:
+    """
+    Mean square of a difference, of each critic where there are several.
+
+    :param values: shape (..., batch, 1)
+    :param targets: without gradient, shape (..., batch, 1)
+    :return: shape (...)
+    """
+    return batch_mean((targets - values).square())
+
+
 def critic_loss(q_values: Sequence[th.Tensor], target_q_values: th.Tensor, td_loss_coef: float | th.Tensor) -> th.Tensor:
     """
     Temporal-difference mean square, summed over the critics (first term of Eq. 6).
@@ -75,7 +86,7 @@ def critic_loss(q_values: Sequence[th.Tensor], target_q_values: th.Tensor, td_lo
     :param td_loss_coef: factor before the mean square; 1 is Eq. 6 as printed, 0.5 gives the paper's theory units
     :return: shape (...)
     """
-    return td_loss_coef * sum_over_critics([batch_mean((target_q_values - q).square()) for q in q_values])
+    return td_loss_coef * sum_over_critics([mean_square(q, target_q_values) for q in q_values])
 
 
 def policy_penalty(q_values: Sequence[th.Tensor], beta: float | th.Tensor) -> th.Tensor:
@@ -393,6 +404,18 @@ def weighted_td_loss(q_values: th.Tensor, target_q_values: th.Tensor, weights: t
     """
     weights = weights.square() if squared else weights
     return batch_mean(weights * (q_values - target_q_values).square()).sum(dim=0)
+
+
+def mmd_penalty(mmd: th.Tensor, alpha: th.Tensor, threshold: th.Tensor) -> th.Tensor:
+    """
+    What a policy that leaves the support of the data pays, ``E[alpha (MMD - threshold)]``; its multiplier ascends on it.
+
+    :param mmd: of each state, shape (..., batch, 1)
+    :param alpha: multiplier, shape (..., 1)
+    :param threshold: MMD above which alpha rises, 0-dimensional
+    :return: shape (...)
+    """
+    return batch_mean(alpha * (mmd - threshold))
 
 
 def gaussian_mmd(samples: th.Tensor, other_samples: th.Tensor, sigma: float | th.Tensor) -> th.Tensor:

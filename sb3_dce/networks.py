@@ -77,6 +77,8 @@ class OfflineCritic(KeepDtype, ContinuousCritic):
     Dropout masks are arguments of :meth:`forward` instead of random draws inside it, so that every way of running an
     update (eager, compiled, many models at once) drops the same units. Without masks nothing is dropped.
 
+    Parameters not listed here are those of Stable-Baselines3's ``ContinuousCritic``.
+
     :param layer_norm: put a ``LayerNorm`` before each hidden activation
     """
 

@@ -283,8 +283,8 @@ def update(
         q_all = critics["critic"](params, states, actions) + q_prior
         q_data, q_ood = q_all[..., :n, :], q_all[..., n:, :]
         pseudo_targets = _pseudo_targets(options, q_ood.detach(), n_ood, coef)
-        td = losses.batch_mean((q_data - y).square())
-        ood = losses.batch_mean((q_ood - pseudo_targets).square())
+        td = losses.mean_square(q_data, y)
+        ood = losses.mean_square(q_ood, pseudo_targets)
         return (td + ood).sum(), (q_data, q_ood, td, ood)
 
     clip = options.max_grad_norm

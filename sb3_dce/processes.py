@@ -7,6 +7,42 @@ import multiprocessing.connection
 import os
 import signal
 import threading
+from types import FrameType
+
+
+class UninterruptedBlock:
+    """
+    Ctrl-C waits for the end of the block, so that nothing is left half done; a second one does not wait.
+
+    Only in the main thread, where Python delivers it, and only if nobody has replaced Python's own handler.
+    """
+
+    def __enter__(self) -> UninterruptedBlock:
+        self._asked = False
+        here = threading.current_thread() is threading.main_thread()
+        self._replaced = here and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        if self._replaced:
+            signal.signal(signal.SIGINT, self._note)
+        return self
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self._asked:
+            signal.default_int_handler(number, frame)
+        self._asked = True
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._replaced:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        if self._asked and kind is None:
+            raise KeyboardInterrupt
+
+
+def threads_from_environment() -> int:
+    """
+    :return: what ``OMP_NUM_THREADS`` says, the first number where it is a list; 0 if it says nothing
+    """
+    first = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()
+    return int(first) if first.isdecimal() else 0
 
 
 def prepare_worker() -> None:

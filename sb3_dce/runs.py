@@ -8,7 +8,8 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from importlib.metadata import version
@@ -26,7 +27,8 @@ from sb3_dce.agents import agent_class
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.data import find_file
 from sb3_dce.data.hashes import sha256_once
-from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError
+from sb3_dce.data.locking import exclusive
+from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError, DownloadError
 from sb3_dce.evaluation import Evaluation, EvaluationCallback, catalogue_id, rollouts_of, write_evaluations
 from sb3_dce.files import write_atomically
 
@@ -118,6 +120,29 @@ def run(spec: RunSpec, report: Report = lambda progress: None) -> dict[str, Any]
     model = _model(spec, folder)
     model.attach_dataset()
     folder.mkdir(parents=True, exist_ok=True)  # not before: a run that is refused leaves nothing behind
+    with _alone(folder):
+        if (done := read_result(folder)) is not None and done["n_updates"] == spec.n_updates:
+            return done
+        return _train(spec, model, folder, report)
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Two processes in one folder would mix their files."""
+    lock = exclusive(folder / ".lock", limit=0.0)
+    try:
+        lock.__enter__()
+    except DownloadError as error:
+        hint = "Wait for it, or take another --out. If that process is gone, delete the file .lock there."
+        raise CheckpointError(f"another process is at this run: {error.what}", where=str(folder), hint=hint) from error
+    try:
+        yield
+    finally:
+        lock.__exit__(None, None, None)
+
+
+def _train(spec: RunSpec, model: OfflineAlgorithm, folder: Path, report: Report) -> dict[str, Any]:
+    model.planned_updates = spec.n_updates
     dataset_id = catalogue_id(model.dataset)
     write_config(spec, model, folder)
     model.set_logger(Logger(str(folder), [make_output_format("csv", str(folder), f"_{model.num_timesteps}")]))
@@ -177,7 +202,8 @@ def read_result(folder: Path) -> dict[str, Any] | None:
     :return: its result, ``None`` if it is not complete
     :raises CheckpointError: if the file is damaged
     """
-    return _read(folder / "result.json", json.loads, ("config", "n_updates", "seconds", "mean_return", "normalized_score"))
+    keys = ("config", "n_updates", "seconds", "mean_return", "normalized_score")
+    return _read(folder / "result.json", json.loads, keys)
 
 
 def write_divergence(folder: Path, n_updates: int, reason: str) -> None:
@@ -219,7 +245,8 @@ def _config(spec: RunSpec) -> dict[str, Any]:
 
 def refuse_other_run(spec: RunSpec, folder: Path) -> None:
     """
-    A run is only continued with the settings it was begun with; it may be made longer.
+    A run is only continued with the settings it was begun with; it may be made longer, unless a learning rate follows its
+    length: the longer run would be another one from its first step on.
 
     :param spec: what is to be run
     :param folder: where a run may have been begun
@@ -232,7 +259,9 @@ def refuse_other_run(spec: RunSpec, folder: Path) -> None:
     wanted = _plain(_config(spec))
     differing = [key for key in wanted if key not in ("n_updates", "dataset") and begun.get(key) != wanted[key]]
     done = read_result(folder)
-    if done is not None and done["n_updates"] > spec.n_updates:
+    length = begun.get("n_updates")
+    shorter = done is not None and done["n_updates"] > spec.n_updates
+    if shorter or (length != wanted["n_updates"] and _depends_on_length(config)):
         differing.append("n_updates")
     changes = [f"{key}={begun.get(key)!r} there, {wanted[key]!r} now" for key in differing]
     # The same data may be named otherwise: by an id, from another folder, after a move.
@@ -246,6 +275,13 @@ def refuse_other_run(spec: RunSpec, folder: Path) -> None:
             path=folder,
             hint=OTHER_FOLDER,
         )
+
+
+def _depends_on_length(config: dict[str, Any]) -> bool:
+    settings = config.get("hyperparameters")
+    settings = settings if isinstance(settings, dict) else {}
+    scheduled = isinstance(settings.get("learning_rate"), str)  # a function, as text
+    return scheduled or settings.get("actor_lr_schedule") == "cosine"
 
 
 def check_before_running(specs: Sequence[RunSpec]) -> None:
@@ -288,7 +324,8 @@ def _read(path: Path, parse: Callable[[str], Any], keys: Sequence[str] = ()) -> 
         content = parse(path.read_text(encoding="utf-8"))
     except (ValueError, yaml.YAMLError, RecursionError, OSError) as error:
         raise CheckpointError("the file is damaged", where=str(path), path=path, hint=BEGIN_ANEW) from error
-    if not isinstance(content, dict) or not all(key in content for key in keys):
+    complete = isinstance(content, dict) and all(key in content for key in keys)
+    if not complete or ("n_updates" in keys and not isinstance(content["n_updates"], int)):
         raise CheckpointError("the file is not that of a run", where=str(path), path=path, hint=BEGIN_ANEW)
     return content
 

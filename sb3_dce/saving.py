@@ -7,6 +7,7 @@ import json
 import pathlib
 import pickle
 import zipfile
+import zlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -17,7 +18,7 @@ from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 
 from sb3_dce import hyperparams
-from sb3_dce.errors import CheckpointError, DivergenceError
+from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError, SB3DCEError
 from sb3_dce.files import write_atomically
 
 DAMAGED = "The file is damaged or something else: give a zip file written by model.save()."
@@ -25,10 +26,19 @@ DAMAGED = "The file is damaged or something else: give a zip file written by mod
 SelfSaving = TypeVar("SelfSaving", bound="SavingMixin")
 
 # Not in the zip: what is large, what can be made again, and what SB3 would pickle although nothing needs it.
+# Without these there is no model.
+MEMBERS = ("data", "policy.pth", "pytorch_variables.pth")
+# What reading a damaged file can end in; Stable-Baselines3 makes ValueErrors of some.
+UNREADABLE = (
+    *(zipfile.BadZipFile, zlib.error, pickle.UnpicklingError, EOFError, OSError, RuntimeError, NotImplementedError),
+    *(ValueError, LookupError, TypeError, AttributeError, RecursionError),
+)
+# Beginnings of its messages on arguments of ``load``, which are no damage.
+ABOUT_ARGUMENTS = ("The specified policy kwargs", "Observation spaces do not match", "Action spaces do not match")
 # Arguments that decide which rows of the data are trained on.
 CHOOSES_ROWS = frozenset({"fraction", "d4rl_compat"})
 EXCLUDED = (
-    *("_transitions", "_engine", "_generator", "_coef", "_metrics_read_at"),
+    *("planned_updates", "_transitions", "_engine", "_generator", "_coef", "_metrics_read_at"),
     *("_last_obs", "_last_episode_starts", "_last_original_obs", "ep_info_buffer", "ep_success_buffer"),
 )
 
@@ -37,6 +47,7 @@ class SavingMixin(OffPolicyAlgorithm):
     """What :class:`~sb3_dce.base.OfflineAlgorithm` changes about saving and loading."""
 
     algo_name: ClassVar[str]
+    dataset: str | None
     dataset_statistics: dict[str, Any] | None
     _generator: th.Generator | None
     rng_state: th.Tensor
@@ -61,16 +72,10 @@ class SavingMixin(OffPolicyAlgorithm):
         :param path: file name (".zip" is appended if it has no suffix) or binary file object
         :param exclude: attributes left out
         :param include: attributes saved although they are excluded by default
-        :raises DivergenceError: if a parameter is not finite
+        :raises DivergenceError: if a parameter, a moment of an optimizer or the temperature is not finite
         :raises CheckpointError: if the file cannot be written
         """
-        for name, parameter in self.policy.named_parameters():
-            if not bool(th.isfinite(parameter).all()):
-                raise DivergenceError(
-                    f"refusing to save: {name} is not finite",
-                    key=name,
-                    hint="Go back to an earlier checkpoint; lower learning_rate or beta.",
-                )
+        _refuse_not_finite(self, DivergenceError, "refusing to save")
         if self._generator is not None:
             self.rng_state = self._generator.get_state()
         if isinstance(path, io.IOBase):
@@ -111,12 +116,21 @@ class SavingMixin(OffPolicyAlgorithm):
         hyperparams.check_keys(cls, kwargs, where=f"{cls.__name__}.load")
         source, dataset = cls._own_file(path), kwargs.pop("dataset", None)
         saved_seed = _saved_data(source).get("seed")
+        _refuse_damage(source)
         try:
             model = super().load(source, env, device, custom_objects, print_system_info, force_reset, **kwargs)
-        except (zipfile.BadZipFile, pickle.UnpicklingError, EOFError, RuntimeError) as error:
+        except SB3DCEError:
+            raise
+        except UNREADABLE as error:
+            text = str(error).strip() or type(error).__name__
+            if isinstance(error, ValueError) and text.startswith(ABOUT_ARGUMENTS):
+                raise ConfigError(text, where=_name_of(source), hint="Leave it out, or give what fits the model.") from error
             raise CheckpointError(
-                f"the model cannot be read: {str(error).splitlines()[0][:200]}", where=_name_of(source), hint=DAMAGED
+                f"the model cannot be read: {text.splitlines()[0][:200]}", where=_name_of(source), hint=DAMAGED
             ) from error
+        if not isinstance(model.dataset, str | None):
+            raise CheckpointError(f"its dataset is {model.dataset!r}", where=_name_of(source), hint=DAMAGED)
+        _refuse_not_finite(model, CheckpointError, "the model cannot be used")
         if kwargs.get("seed") not in (None, saved_seed):  # the saved state of the generator would go on regardless
             model.set_random_seed(kwargs["seed"])
         if CHOOSES_ROWS & set(kwargs):
@@ -198,8 +212,8 @@ def saved_algo(path: Path | io.BufferedIOBase) -> str | None:
     :return: name of the agent, ``None`` for a model of another package
     :raises CheckpointError: if it is no saved model
     """
-    algo: str | None = _saved_data(path).get("algo")
-    return algo
+    algo = _saved_data(path).get("algo")
+    return algo if isinstance(algo, str) else None
 
 
 def _saved_data(path: Path | io.BufferedIOBase) -> dict[str, Any]:
@@ -214,6 +228,37 @@ def _saved_data(path: Path | io.BufferedIOBase) -> dict[str, Any]:
     if isinstance(path, io.IOBase):
         path.seek(position)
     return saved if isinstance(saved, dict) else {}
+
+
+def _refuse_damage(source: Path | io.BufferedIOBase) -> None:
+    """A flipped bit, or a part that is gone: without the tensors temperature and random state would silently begin anew."""
+    position = source.tell() if isinstance(source, io.IOBase) else 0
+    where = _name_of(source)
+    try:
+        with zipfile.ZipFile(source) as archive:
+            bad, missing = archive.testzip(), [name for name in MEMBERS if name not in archive.namelist()]
+    except UNREADABLE as error:
+        raise CheckpointError(f"the model cannot be read: {error}", where=where, hint=DAMAGED) from error
+    if bad is not None or missing:
+        what = f"the part {bad!r} is damaged" if bad is not None else f"the part {missing[0]!r} is missing"
+        raise CheckpointError(what, where=where, hint=DAMAGED)
+    if isinstance(source, io.IOBase):
+        source.seek(position)
+
+
+def _refuse_not_finite(model: Any, error: type[SB3DCEError], what: str) -> None:
+    """Numbers that would be found out much later; the state of the random generator is none."""
+    modules, tensors = model._get_torch_save_params()
+    named = list(model.policy.named_parameters())
+    named += [(name, recursive_getattr(model, name)) for name in tensors if name != "rng_state"]
+    for name in modules:
+        if name.endswith("optimizer"):
+            states = recursive_getattr(model, name).state.values()
+            named += [(f"{name} ({key})", value) for state in states for key, value in state.items()]
+    for name, tensor in named:
+        if isinstance(tensor, th.Tensor) and not bool(th.isfinite(tensor).all()):
+            hint = "Go back to an earlier checkpoint; lower learning_rate or beta."
+            raise error(f"{what}: {name} is not finite", key=name, hint=hint)
 
 
 def _name_of(source: Path | io.BufferedIOBase) -> str:

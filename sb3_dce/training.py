@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from sb3_dce import hyperparams
 from sb3_dce.agents import agent_class
 from sb3_dce.base import OfflineAlgorithm
+from sb3_dce.checks import check_ends_with_evaluation
 from sb3_dce.data import find_file
 from sb3_dce.data.catalog import resolve
 from sb3_dce.data.locate import short_name
@@ -58,9 +60,12 @@ def train_seeds(
     path, spec = find_file(dataset)
     row = hyperparams.load_row(algo, None if spec is None else spec.id)
     total = n_updates or hyperparams.split_row(row).n_timesteps
+    if spec is not None and missing_simulator(spec) is None:
+        check_ends_with_evaluation(total, eval_freq)
     name = short_name(dataset)
     folder = out or Path("runs") / f"{algo}-{name}"
-    console.print(f"[b]{algo}[/b] on [b]{name}[/b] ({path}), {total:,} gradient steps, seeds {list(seeds)}")
+    where = f"[b]{escape(name)}[/b] ({escape(str(path))})"
+    console.print(f"[b]{algo}[/b] on {where}, {total:,} gradient steps, seeds {escape(str(list(seeds)))}")
     specs = [
         RunSpec(algo, dataset, seed, total, str(folder / f"seed_{seed}"), eval_freq, n_eval_episodes, overrides)
         for seed in seeds
@@ -69,7 +74,8 @@ def train_seeds(
     show_results({algo: results}, console)
     curves = {algo: [read_evaluations(Path(s.folder), None if spec is None else spec.id) for s in specs]}
     picture = plot_learning_curves(curves, folder / "learning_curve.png", title=name)
-    console.print(f"saved  {folder}/seed_*/model.zip, config.yml, evaluations.csv" + (f", {picture.name}" if picture else ""))
+    drawn = f", {picture.name}" if picture else ""
+    console.print(f"saved  {folder}/seed_*/model.zip, config.yml, evaluations.csv{drawn}", markup=False)
     console.print(f"next   sb3-dce evaluate {specs[0].folder}/model.zip", markup=False)
     return results
 

@@ -359,7 +359,7 @@ def update(
         before_tanh = mean + log_std.exp() * noise["mmd_actor"]
         a_pi, log_prob = losses.squashed_gaussian(mean, log_std, noise["mmd_actor"][0])
         mmd = losses.gaussian_mmd(before_tanh, like_data, coef["mmd_sigma"])
-        loss = losses.batch_mean(alpha * (mmd - coef["mmd_threshold"]))
+        loss = losses.mmd_penalty(mmd, alpha, coef["mmd_threshold"])
         if mmd_only:
             return loss, (mmd, a_pi, log_prob)
         masks = _masks(options, noise, "actor_dropout")
@@ -380,7 +380,7 @@ def update(
 
     # 5 multiplier: ascends on the actor loss, in which the actor saw it before its step
     def multiplier_loss(log_alpha: th.Tensor) -> tuple[th.Tensor, tuple[()]]:
-        return -losses.batch_mean(log_alpha.exp() * (mmd - coef["mmd_threshold"])), ()
+        return -losses.mmd_penalty(mmd, log_alpha.exp(), coef["mmd_threshold"]), ()
 
     rate = coef["log_alpha_learning_rate"]
     learner, _, _, _ = descend(multiplier_loss, state[LOG_ALPHA], rate, settings[LOG_ALPHA])

@@ -127,10 +127,10 @@ def test_a_run_goes_on_with_the_same_data_from_another_place_and_with_no_other(
     shutil.copy(find_file(TINY)[0], tmp_path / "moved.hdf5")
     load_transitions(TINY).to_hdf5(tmp_path / "other.hdf5")
     monkeypatch.chdir(tmp_path)
-    longer = ("--updates", "70", "--eval-freq", "30", "--eval-episodes", "2", "--seeds", "1", *FAST, "--out", str(folder))
+    longer = ("--updates", "90", "--eval-freq", "30", "--eval-episodes", "2", "--seeds", "1", *FAST, "--out", str(folder))
     result = sb3_dce("train", "moved.hdf5", *longer)
     assert result.code == 0, result
-    assert json.loads((folder / "seed_0" / "result.json").read_text())["n_updates"] == 70
+    assert json.loads((folder / "seed_0" / "result.json").read_text())["n_updates"] == 90
     assert "dataset=" in refused(sb3_dce("train", "other.hdf5", *longer))
 
 

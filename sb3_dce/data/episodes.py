@@ -151,7 +151,7 @@ def fill_next_observations(rows: np.ndarray, layout: RowLayout, terminals: np.nd
     """
     Take the next row's observation as next observation. The last row gets its own.
 
-    :param rows: row matrix, changed in place
+    :param rows: row matrix of :class:`~sb3_dce.data.layout.RowLayout`, shape (n, width), changed in place
     :param layout: its columns
     :param terminals: rows that get their own observation (finite, and never used because d = 1); None as D4RL does, which
         gives them the first observation of the next episode
@@ -169,7 +169,7 @@ def find_jumps(rows: np.ndarray, layout: RowLayout) -> np.ndarray:
     """
     Rows whose next observation is not the observation of the next row (Euclidean distance above 1e-6).
 
-    :param rows: row matrix
+    :param rows: row matrix of :class:`~sb3_dce.data.layout.RowLayout`, shape (n, width)
     :param layout: its columns
     :return: shape (rows,), bool; False for the last row
     """
@@ -190,7 +190,7 @@ def find_shift(rows: np.ndarray, layout: RowLayout, inner: np.ndarray) -> int | 
     """
     By how many rows the next observations are displaced against the observations.
 
-    :param rows: row matrix
+    :param rows: row matrix of :class:`~sb3_dce.data.layout.RowLayout`, shape (n, width)
     :param layout: its columns
     :param inner: rows that are not the last of their episode
     :return: k if next observation i equals observation i + 1 + k in more than half of the rows, else None

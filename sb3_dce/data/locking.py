@@ -56,15 +56,24 @@ def _create(path: Path) -> bool:
     except FileExistsError:
         return False
     with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-        json.dump({"pid": os.getpid(), "host": socket.gethostname()}, file)
+        json.dump({"pid": os.getpid(), "host": socket.gethostname(), "started": _started(os.getpid())}, file)
     return True
 
 
-def _read(path: Path) -> tuple[int, str] | None:
-    """Process and machine of the owner; None if the lock is gone, or not yet or never written."""
+def _started(pid: int) -> str | None:
+    """When a process began, in the kernel's clock: a number may be in use again. None where the system does not tell."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
+        return fields[19]
+    except (OSError, IndexError):
+        return None
+
+
+def _read(path: Path) -> tuple[int, str, str | None] | None:
+    """Process, machine and beginning of the owner; None if the lock is gone, or not yet or never written."""
     try:
         owner = json.loads(path.read_bytes())
-        return int(owner["pid"]), str(owner["host"])
+        return int(owner["pid"]), str(owner["host"]), owner.get("started")
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return None
 
@@ -78,7 +87,7 @@ def _is_abandoned(path: Path) -> bool:
     owner = _read(path)
     if owner is None:  # a process that dies before it has written its name leaves an empty lock
         return _age(path) > _TAKEOVER_SECONDS
-    pid, host = owner
+    pid, host, started = owner
     if host != socket.gethostname() or os.name == "nt":  # on Windows os.kill would end the process
         return False
     try:
@@ -87,7 +96,9 @@ def _is_abandoned(path: Path) -> bool:
         return True
     except PermissionError:  # it lives, as another user
         return False
-    return pid <= 0  # no process has such a number
+    now = _started(pid)
+    other = started is not None and now is not None and started != now
+    return other or pid <= 0  # no process has such a number
 
 
 def _age(path: Path) -> float:

@@ -60,7 +60,7 @@ def check_finite(
     Look for NaN and infinity.
 
     :param summaries: of all arrays that were read
-    :param rows: row matrix, next observations filled in
+    :param rows: row matrix of :class:`~sb3_dce.data.layout.RowLayout`, shape (n, width), next observations filled in
     :param usable: rows that would be used, shape (rows,)
     :param drop: whether such rows may be dropped
     :param where: file, for messages
@@ -176,7 +176,7 @@ def check_order(
     A few unmarked jumps are legal, D4RL's replay sets have them: an episode ends there. If there are many, either the
     next observations are displaced, or the rows are no sequence at all (shuffled transitions), which training does not mind.
 
-    :param rows: row matrix
+    :param rows: row matrix of :class:`~sb3_dce.data.layout.RowLayout`, shape (n, width)
     :param layout: its columns
     :param terminals: shape (rows,), bool
     :param timeouts: shape (rows,), bool, None if the file has none
@@ -217,7 +217,7 @@ def check_duplicates(rows: np.ndarray, findings: Findings) -> None:
     """
     Look for rows that occur more than once, by a hash of each row.
 
-    :param rows: row matrix
+    :param rows: row matrix of :class:`~sb3_dce.data.layout.RowLayout`, shape (n, width)
     :param findings: notes and warnings
     """
     hashes = np.empty(len(rows), dtype=np.uint32)

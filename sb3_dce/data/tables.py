@@ -88,6 +88,7 @@ def arrays_from_csv(
     :return: key to array, float64
     :raises DatasetFormatError: if a column is missing or a line is wrong; the message has its number and the column
     :raises DatasetError: if the file is missing, too large, or not text
+    :raises ConfigError: if ``sep`` is not one character
     """
     path = require_file(path)
     if len(sep) != 1:

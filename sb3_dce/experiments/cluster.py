@@ -123,8 +123,9 @@ def train_on_node(spec: RunSpec) -> Outcome:
 
     from sb3_dce import launch, runs
     from sb3_dce.data.locate import cache_folder
+    from sb3_dce.processes import threads_from_environment
 
-    th.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", 0)) or 1)
+    th.set_num_threads(threads_from_environment() or 1)
     node = os.environ.get("SB3_DCE_NODE") or platform.node()
     folder = cache_folder().parent / "cluster" / node / Path(spec.folder).name
     here = replace(spec, folder=str(folder))

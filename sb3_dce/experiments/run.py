@@ -60,7 +60,10 @@ def execute(
     device = get_device(device)
     failures = _run_all(first, workers, device, ray_address, console)
     without = [best_policy for _, best_policy in after if read_divergence(best_policy) is not None]
-    failures += [DivergenceError(f"the probe needs the last policy of {path.name}, which diverged") for path in without]
+    hint = "Take another --first-seed, or leave the probe out with --agents DCE."
+    failures += [
+        DivergenceError(f"the probe needs the last policy of {path.name}, which diverged", hint=hint) for path in without
+    ]
     after = [(spec, best_policy) for spec, best_policy in after if best_policy not in without]
     for spec, best_policy in after:
         prepare_probe(spec, best_policy)

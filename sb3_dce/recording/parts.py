@@ -92,7 +92,12 @@ class Parts:
     def _read(self) -> None:
         if not self._settings_file.is_file():
             return
-        written = json.loads(self._settings_file.read_text(encoding="utf-8"))
+        try:
+            written = dict(json.loads(self._settings_file.read_text(encoding="utf-8")))
+        except (ValueError, TypeError, RecursionError) as error:
+            raise CheckpointError(
+                "the file is damaged", where=str(self._settings_file), hint="Delete its folder; the recording begins anew."
+            ) from error
         differing = [key for key in self.settings if written.get(key) != self.settings[key]]
         if differing:
             changes = ", ".join(f"{key}={written.get(key)!r} there, {self.settings[key]!r} now" for key in differing)

@@ -1,0 +1,273 @@
+"""Kills, damage and second processes: what is lost is little, and what is wrong is said, never used."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch as th
+from commands import sb3_dce
+
+from sb3_dce import OfflineDCE, OfflineIQL, files
+from sb3_dce.data.locking import exclusive
+from sb3_dce.errors import CheckpointError, ConfigError, DatasetWarning, DivergenceError
+from sb3_dce.evaluation import EvaluationCallback
+from sb3_dce.execution import Engine
+from sb3_dce.processes import UninterruptedBlock, threads_from_environment
+from sb3_dce.runs import RunSpec, read_result, run
+
+TINY = "halfcheetah-tiny-sb3"
+SMALL: dict[str, Any] = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "execution": "eager"}
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("model") / "model.zip"
+    OfflineDCE.load_dataset(TINY, seed=0, **SMALL).learn(3).save(path)
+    return path
+
+
+# -- damaged models ----------------------------------------------------------------------------------------------------
+
+
+def flipped(saved: Path, offset: int, target: Path) -> Path:
+    content = bytearray(saved.read_bytes())
+    content[offset] ^= 0x10
+    target.write_bytes(content)
+    return target
+
+
+def test_a_flipped_bit_in_any_part_of_a_model_is_found(saved: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(saved) as archive:
+        infos = archive.infolist()
+    assert len(infos) > 6
+    for info in infos:
+        content_at = info.header_offset + 30 + len(info.filename.encode())
+        path = flipped(saved, content_at + info.compress_size // 2, tmp_path / "model.zip")
+        with pytest.raises(CheckpointError, match=r"damaged|cannot be read|not a saved model"):
+            OfflineDCE.load(path)
+
+
+def test_bits_flipped_anywhere_end_in_words_or_do_no_harm(saved: Path, tmp_path: Path) -> None:
+    rng, whole = random.Random(0), OfflineDCE.load(saved).policy.state_dict()
+    found = 0
+    for _ in range(60):
+        path = flipped(saved, rng.randrange(saved.stat().st_size), tmp_path / "model.zip")
+        try:
+            loaded = OfflineDCE.load(path).policy.state_dict()
+        except (CheckpointError, ConfigError):
+            found += 1
+        else:  # a field of the archive that nobody reads, such as a date
+            assert all(th.equal(loaded[key], whole[key]) for key in whole)
+    assert found > 50
+
+
+@pytest.mark.parametrize("name", ["data", "policy.pth", "pytorch_variables.pth", "actor.optimizer.pth"])
+def test_model_without_one_of_its_parts(name: str, saved: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(saved) as old, zipfile.ZipFile(tmp_path / "model.zip", "w") as new:
+        assert name in old.namelist()
+        for info in old.infolist():
+            if info.filename != name:
+                new.writestr(info.filename, old.read(info))
+    with pytest.raises(CheckpointError, match=r"missing|not a saved model"):
+        OfflineDCE.load(tmp_path / "model.zip")
+
+
+@pytest.mark.parametrize(
+    "change", [{"algo": ["x"]}, {"observation_space": 1}, {"dataset": 5}, {"policy_class": None}], ids=str
+)
+def test_model_with_a_wrong_field_is_refused_by_the_command_in_words(
+    change: dict[str, Any], saved: Path, tmp_path: Path
+) -> None:
+    with zipfile.ZipFile(saved) as old, zipfile.ZipFile(tmp_path / "model.zip", "w") as new:
+        for info in old.infolist():
+            content = old.read(info)
+            if info.filename == "data":
+                content = json.dumps({**json.loads(content), **change}).encode()
+            new.writestr(info.filename, content)
+    result = sb3_dce("evaluate", str(tmp_path / "model.zip"))
+    assert result.code == 2 and "Traceback" not in result.stderr and "model.zip" in result.stderr
+
+
+def test_arguments_that_do_not_fit_the_model_are_not_called_damage(saved: Path, make_point_mass: Any) -> None:
+    with pytest.raises(ConfigError, match="spaces do not match"):
+        OfflineDCE.load(saved, env=make_point_mass())
+    with pytest.raises(ConfigError, match="policy kwargs do not equal"):
+        OfflineDCE.load(saved, policy_kwargs={"net_arch": [9]})
+
+
+def test_numbers_that_are_not_finite_are_neither_saved_nor_loaded(saved: Path, tmp_path: Path) -> None:
+    model = OfflineDCE.load_dataset(TINY, ent_coef="auto", **SMALL).learn(2)
+    first = next(iter(model.actor.optimizer.state.values()))["exp_avg"]
+    for tensor in (model.log_ent_coef, first):
+        kept = tensor.detach().clone()
+        with th.no_grad():
+            tensor.fill_(float("nan"))
+        with pytest.raises(DivergenceError, match=r"refusing to save.*not finite"):
+            model.save(tmp_path / "bad.zip")
+        with th.no_grad():
+            tensor.copy_(kept)
+    model.save(tmp_path / "bad.zip")
+    policy = th.load(zipfile.ZipFile(tmp_path / "bad.zip").open("policy.pth"))
+    policy["actor.mu.bias"].fill_(float("inf"))
+    with zipfile.ZipFile(tmp_path / "bad.zip") as old, zipfile.ZipFile(tmp_path / "worse.zip", "w") as new:
+        for info in old.infolist():
+            if info.filename != "policy.pth":
+                new.writestr(info.filename, old.read(info))
+        with new.open("policy.pth", "w") as stream:
+            th.save(policy, stream)
+    with pytest.raises(CheckpointError, match=r"cannot be used.*actor.mu.bias"):
+        OfflineDCE.load(tmp_path / "worse.zip")
+
+
+# -- runs --------------------------------------------------------------------------------------------------------------
+
+
+def spec(folder: Path, n_updates: int, algo: str = "dce", **overrides: Any) -> RunSpec:
+    return RunSpec(algo, TINY, 0, n_updates, str(folder), 10, 1, {**SMALL, **overrides})
+
+
+def test_a_run_whose_learning_rate_follows_its_length_is_not_made_longer(tmp_path: Path) -> None:
+    run(spec(tmp_path / "iql", 20, "offline_iql", actor_lr_schedule="cosine"))
+    with pytest.raises(ConfigError, match="n_updates=20 there, 30 now"):
+        run(spec(tmp_path / "iql", 30, "offline_iql", actor_lr_schedule="cosine"))
+    run(spec(tmp_path / "plain", 20, "offline_iql", actor_lr_schedule="constant"))
+    assert run(spec(tmp_path / "plain", 30, "offline_iql", actor_lr_schedule="constant"))["n_updates"] == 30
+
+
+def test_what_is_resumed_is_executed_as_it_was_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    planned: list[int] = []
+    original = OfflineDCE._bound_engine
+
+    def note(self: OfflineDCE, planned_updates: int) -> Any:
+        planned.append(planned_updates)
+        return original(self, planned_updates)
+
+    monkeypatch.setattr(OfflineDCE, "_bound_engine", note)
+    run(spec(tmp_path, 20))
+    run(spec(tmp_path, 30))
+    assert set(planned[:20]) == {20} and set(planned[20:]) == {30}, "not what remains, 10"
+    assert OfflineDCE.load(tmp_path / "model.zip").planned_updates is None
+
+
+def test_a_second_process_leaves_a_run_alone(tmp_path: Path) -> None:
+    tmp_path.joinpath("run").mkdir()
+    with exclusive(tmp_path / "run" / ".lock"), pytest.raises(CheckpointError, match=r"another process is at this run.*--out"):
+        run(spec(tmp_path / "run", 10))
+    assert read_result(tmp_path / "run") is None
+    assert run(spec(tmp_path / "run", 10))["n_updates"] == 10
+    assert not (tmp_path / "run" / ".lock").exists()
+
+
+def test_lock_of_a_process_whose_number_is_in_use_again_is_not_waited_for(tmp_path: Path) -> None:
+    if not Path("/proc/self/stat").exists():
+        pytest.skip("the system does not tell when a process began")
+    with exclusive(tmp_path / "lock"):
+        owner = json.loads((tmp_path / "lock").read_text())
+    assert owner["pid"] == os.getpid() and owner["started"]
+    (tmp_path / "lock").write_text(json.dumps({**owner, "started": "1"}))
+    began = time.monotonic()
+    with exclusive(tmp_path / "lock", limit=60.0):
+        assert time.monotonic() - began < 30.0
+
+
+def test_lengths_that_do_not_end_with_an_evaluation_are_refused(tmp_path: Path) -> None:
+    result = sb3_dce("train", TINY, "--updates", "30", "--eval-freq", "20", "--out", str(tmp_path / "run"))
+    assert result.code == 2 and "do not end with an evaluation" in result.stderr and not (tmp_path / "run").exists()
+
+
+def test_folder_that_cannot_be_written_is_said_before_training(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    callback = EvaluationCallback(None, None, eval_freq=5, folder=tmp_path / "file" / "below", save_checkpoint=True)
+    model = OfflineDCE.load_dataset(TINY, **SMALL)
+    with pytest.raises(CheckpointError, match="cannot write"):
+        model.learn(10, callback)
+    assert model.num_timesteps == 0
+
+
+# -- interruptions -----------------------------------------------------------------------------------------------------
+
+
+def test_ctrl_c_waits_for_the_end_of_an_update() -> None:
+    steps: list[str] = []
+    with pytest.raises(KeyboardInterrupt), UninterruptedBlock():
+        signal.raise_signal(signal.SIGINT)
+        steps.append("after the first")
+    assert steps == ["after the first"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    with pytest.raises(KeyboardInterrupt), UninterruptedBlock():
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        steps.append("never")
+    with pytest.raises(ValueError, match="own"), UninterruptedBlock():
+        signal.raise_signal(signal.SIGINT)
+        raise ValueError("own")
+    assert steps == ["after the first"]
+
+
+def test_interrupted_model_is_whole_and_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    model, straight = (OfflineIQL.load_dataset(TINY, seed=0, actor_lr_schedule="constant", **SMALL) for _ in range(2))
+    straight.learn(20, log_interval=None)
+    original, calls = Engine.step, 0
+
+    def step(self: Engine, *args: Any, **kwargs: Any) -> None:
+        """Ctrl-C when the batch is drawn, or when the networks are written and nothing is counted yet."""
+        nonlocal calls
+        calls += 1
+        if calls % 5 == 0:
+            signal.raise_signal(signal.SIGINT)
+        original(self, *args, **kwargs)
+        if calls % 7 == 0:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Engine, "step", step)
+    interruptions = 0
+    while model._n_updates < 20:
+        try:
+            model.learn(20 - model._n_updates, reset_num_timesteps=False, log_interval=None)
+        except KeyboardInterrupt:
+            interruptions += 1
+        trained = [getattr(model, name).optimizer for name in ("actor", "critic", "value_net")]
+        steps = {float(state["step"]) for optimizer in trained for state in optimizer.state.values()}
+        assert steps == {float(model._n_updates)} and model.num_timesteps == model._n_updates
+    assert interruptions == 6
+    assert all(th.equal(a, b) for a, b in zip(model.policy.parameters(), straight.policy.parameters(), strict=True))
+
+
+def test_what_killed_writers_left_is_removed_by_the_next_one(tmp_path: Path) -> None:
+    ended = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
+    old = tmp_path / f".model.zip.{ended.stdout.strip()}.abc.tmp"
+    young, other = old.with_name(old.name.replace("abc", "def")), tmp_path / f".else.zip.{ended.stdout.strip()}.abc.tmp"
+    ours = tmp_path / f".model.zip.{os.getpid()}.abc.tmp"
+    for path in (old, young, other, ours):
+        path.write_bytes(b"half")
+    for path in (old, other, ours):
+        os.utime(path, (0, 0))
+    with files.write_atomically(tmp_path / "model.zip") as stream:
+        stream.write(b"whole")
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left == {"model.zip", young.name, other.name, ours.name}
+
+
+# -- surroundings ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("text", "threads"), [(None, 0), ("", 0), ("2,1", 2), (" 3 ", 3), ("many", 0)])
+def test_number_of_threads_from_the_environment(text: str | None, threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if text is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", text)
+    assert threads_from_environment() == threads
+
+
+def test_fewer_rows_than_a_batch_are_said(random_transitions: Any) -> None:
+    with pytest.warns(DatasetWarning, match="27 rows for batches of 256"):
+        OfflineDCE.load_dataset(random_transitions(30), **{**SMALL, "batch_size": 256}).learn(1)
