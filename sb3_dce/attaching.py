@@ -286,14 +286,15 @@ class AttachingMixin(OffPolicyAlgorithm):
         if self.trained_with_vec_normalize or not env.norm_obs:
             return
         self.trained_with_vec_normalize = True
-        if isinstance(env.obs_rms, RunningMeanStd) and (is_untouched(env.obs_rms) or env.obs_rms.count < FEWEST_OBSERVATIONS):
-            buffer, seen = self._own_buffer(), env.obs_rms.count
+        rms = env.obs_rms
+        if isinstance(rms, RunningMeanStd) and (is_untouched(rms) or 1.0 <= rms.count < FEWEST_OBSERVATIONS):
+            buffer, seen = self._own_buffer(), rms.count
             if seen >= 1.0:
                 warnings.warn(
                     f"VecNormalize has seen {seen:.0f} observations only; its statistics are now those of the dataset",
                     DatasetWarning,
                 )
-            env.obs_rms = RunningMeanStd(shape=env.obs_rms.mean.shape)
+            env.obs_rms = RunningMeanStd(shape=rms.mean.shape)
             env.obs_rms.update(buffer.observations[: buffer.size(), 0])
 
     def check_dataset_fits(self, reward_mean: float, n_terminals: int) -> list[str]:
