@@ -47,8 +47,8 @@ class AttachingMixin(OffPolicyAlgorithm):
     # Filled at attach, saved with the model: what diagnostics and reward scaling need to know of the data.
     dataset_statistics: dict[str, Any] | None
     _transitions: Transitions | None
-    # Saved: without the statistics of its VecNormalize a model is not what was trained.
-    trained_with_vec_normalize: bool = False
+    # Saved: mean and variance of the VecNormalize it was trained behind; with others a model is not what was trained.
+    vec_normalize_statistics: tuple[np.ndarray, np.ndarray] | None = None
 
     @classmethod
     def load_dataset(
@@ -233,7 +233,7 @@ class AttachingMixin(OffPolicyAlgorithm):
                 hint="Read the data as before and give them to model.set_dataset(...); it also takes other data.",
             )
         if buffer.size() < self.batch_size:
-            text = f"{buffer.size():,} rows for batches of {self.batch_size}: every batch draws most of them, some twice"
+            text = f"{buffer.size():,} rows for batches of {self.batch_size}: every batch draws rows more than once"
             warnings.warn(text, DatasetWarning)
         for text in self.check_dataset_fits(self._mean_reward(), info.n_terminals):
             warnings.warn(text, DatasetWarning)
@@ -283,11 +283,10 @@ class AttachingMixin(OffPolicyAlgorithm):
                 key="norm_reward",
                 hint="Use norm_reward=False, or load statistics with VecNormalize.load.",
             )
-        if self.trained_with_vec_normalize or not env.norm_obs:
-            return
-        self.trained_with_vec_normalize = True
         rms = env.obs_rms
-        if isinstance(rms, RunningMeanStd) and (is_untouched(rms) or 1.0 <= rms.count < FEWEST_OBSERVATIONS):
+        if self.vec_normalize_statistics is not None or not env.norm_obs or not isinstance(rms, RunningMeanStd):
+            return
+        if is_untouched(rms) or 1.0 <= rms.count < FEWEST_OBSERVATIONS:
             buffer, seen = self._own_buffer(), rms.count
             if seen >= 1.0:
                 warnings.warn(
@@ -296,6 +295,7 @@ class AttachingMixin(OffPolicyAlgorithm):
                 )
             env.obs_rms = RunningMeanStd(shape=rms.mean.shape)
             env.obs_rms.update(buffer.observations[: buffer.size(), 0])
+        self.vec_normalize_statistics = (env.obs_rms.mean.copy(), env.obs_rms.var.copy())
 
     def check_dataset_fits(self, reward_mean: float, n_terminals: int) -> list[str]:
         """

@@ -11,6 +11,7 @@ import os
 import sys
 import time
 import warnings
+from contextlib import nullcontext
 from typing import Any, ClassVar, TypeVar
 
 import gymnasium as gym
@@ -372,8 +373,10 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         on_device = None if self._vec_normalize_env is not None else generator
         with matmul_precision(self.precision, self.device):
             for _ in range(gradient_steps):
-                with UninterruptedBlock():  # the networks of an update are written one after the other
-                    coef, variant = self._coefficient_tensors(dtype), self.update_variant(self._n_updates)
+                variant = self.update_variant(self._n_updates)
+                # The networks of an update are written one after the other. The first call may compile for a minute.
+                with UninterruptedBlock() if engine.has_run(variant) else nullcontext():
+                    coef = self._coefficient_tensors(dtype)
                     engine.step_drawn(draw, coef, on_device, source, **variant)
                     self._n_updates += 1
                     if self.reads_state_after(self._n_updates):
@@ -445,13 +448,13 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         while keep_going and self.num_timesteps < total_timesteps:
             chunk = min(self.gradient_steps, total_timesteps - self.num_timesteps)
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
-            before = self._n_updates
+            timesteps, updates = self.num_timesteps, self._n_updates
             try:
                 self.train(gradient_steps=chunk, batch_size=self.batch_size)
+                keep_going = self._count_steps(chunk, callback, log_interval)
             except KeyboardInterrupt:
-                self.num_timesteps += self._n_updates - before  # what is saved now can go on
+                self.num_timesteps = timesteps + self._n_updates - updates  # what is saved now can go on
                 raise
-            keep_going = self._count_steps(chunk, callback, log_interval)
         self._refuse_divergence()  # a run may be shorter than the intervals of the log
         callback.on_training_end()
         return self

@@ -206,10 +206,6 @@ def is_untouched(statistics: RunningMeanStd) -> bool:
     return statistics.count < 1.0 and bool(np.all(statistics.mean == 0.0)) and bool(np.all(statistics.var == 1.0))
 
 
-def _knows_nothing(normalizer: VecNormalize) -> bool:
-    return isinstance(normalizer.obs_rms, RunningMeanStd) and is_untouched(normalizer.obs_rms)
-
-
 def vec_normalize_of(model: Any) -> VecNormalize | None:
     """
     What stands between the environment and a model.
@@ -219,15 +215,23 @@ def vec_normalize_of(model: Any) -> VecNormalize | None:
     :raises ConfigError: if it was trained behind one whose statistics are not there
     """
     found: VecNormalize | None = getattr(model, "_vec_normalize_env", None)
-    if getattr(model, "trained_with_vec_normalize", False):
-        if found is None or not found.norm_obs or _knows_nothing(found):
-            raise ConfigError(
-                "the model was trained behind a VecNormalize whose statistics are not here: it would see other observations",
-                key="env",
-                hint=f"Load it with {type(model).__name__}.load(<model>, env=VecNormalize.load(<statistics>, <environment>)). "
-                "Statistics that stay in the model itself: normalize_obs=True.",
-            )
+    known = getattr(model, "vec_normalize_statistics", None)
+    if known is not None and (found is None or not found.norm_obs or not _has(found, known)):
+        raise ConfigError(
+            "the model was trained behind a VecNormalize whose statistics are not here: it would see other observations",
+            key="env",
+            hint=f"Load it with {type(model).__name__}.load(<model>, env=VecNormalize.load(<statistics>, <environment>)). "
+            "Statistics that stay in the model itself: normalize_obs=True.",
+        )
     return found
+
+
+def _has(normalizer: VecNormalize, known: tuple[np.ndarray, np.ndarray]) -> bool:
+    rms = normalizer.obs_rms
+    there = (rms.mean, rms.var) if isinstance(rms, RunningMeanStd) else None
+    return there is not None and all(
+        a.shape == b.shape and np.allclose(a, b, rtol=1e-6) for a, b in zip(there, known, strict=True)
+    )
 
 
 def check_ends_with_evaluation(n_updates: int, eval_freq: int, whose: str = "") -> None:

@@ -23,7 +23,7 @@ from sb3_dce.files import write_atomically
 from sb3_dce.launch import launch
 from sb3_dce.plots import plot_learning_curves
 from sb3_dce.rollouts import Rollouts
-from sb3_dce.runs import RunSpec
+from sb3_dce.runs import RunSpec, alone
 
 DATASET = "halfcheetah-demo-sb3"
 N_UPDATES = 20_000
@@ -99,7 +99,8 @@ def _delete_demo(folder: Path) -> None:
     """Delete what a demo wrote, and nothing else that may lie in the folder."""
     for path in folder.iterdir():
         if path.is_dir() and path.name.startswith(("dce_", "offline_bc_")):
-            shutil.rmtree(path)
+            with alone(path):
+                shutil.rmtree(path)
         elif path.name in ("results.json", "learning_curve.png"):
             path.unlink()
 

@@ -126,6 +126,14 @@ class Engine(Generic[S]):
         self._captured: dict[tuple[Variant, Hashable], CapturedStep] = {}
         self._inputs: dict[Variant, StaticInputs] = {}
         self._guarded_for: set[tuple[Variant, tuple[th.Size, ...]]] = set()
+        self._has_run: set[Variant] = set()
+
+    def has_run(self, variant: dict[str, Any]) -> bool:
+        """
+        :param variant: choices of an update
+        :return: whether such an update was made, so that nothing is left to be compiled or captured
+        """
+        return self.execution == "eager" or tuple(sorted(variant.items())) in self._has_run
 
     def step(self, batch: Any, noise: dict[str, th.Tensor], coef: dict[str, th.Tensor], **variant: Any) -> None:
         """
@@ -165,9 +173,11 @@ class Engine(Generic[S]):
         """
         if self.execution != "cudagraph" or generator is None:
             self.step(*draw(), coef, **variant)
+            self._has_run.add(tuple(sorted(variant.items())))
             return
         with th.no_grad():
             self._replay(self._captured_step(tuple(sorted(variant.items())), draw, coef, generator, source))
+        self._has_run.add(tuple(sorted(variant.items())))
 
     @staticmethod
     def _replay(captured: CapturedStep) -> None:

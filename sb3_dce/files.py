@@ -38,7 +38,7 @@ def write_atomically(target: pathlib.Path) -> Iterator[BinaryIO]:
         temporary = None
         _sync_folder(target.parent)
     except OSError as error:
-        raise _cannot_write(target, error) from error
+        raise cannot_write(target, error) from error
     finally:
         if temporary is not None and os.path.exists(temporary):
             os.unlink(temporary)
@@ -89,10 +89,15 @@ def check_writable(target: pathlib.Path) -> None:
         with tempfile.TemporaryFile(dir=target.parent):
             pass
     except OSError as error:
-        raise _cannot_write(target, error) from error
+        raise cannot_write(target, error) from error
 
 
-def _cannot_write(target: pathlib.Path, error: OSError) -> CheckpointError:
+def cannot_write(target: pathlib.Path, error: OSError) -> CheckpointError:
+    """
+    :param target: file that was to be written
+    :param error: why it was not
+    :return: the error in words
+    """
     return CheckpointError(
         f"cannot write: {error.strerror or error}",
         where=str(target),

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,7 +38,7 @@ from sb3_dce.files import write_atomically
 from sb3_dce.launch import launch, progress_display, show_evaluation
 from sb3_dce.population import Population
 from sb3_dce.rollouts import Rollouts
-from sb3_dce.runs import RunSpec, read_result, refuse_other_run, write_config, write_divergence, write_result
+from sb3_dce.runs import RunSpec, alone, read_result, refuse_other_run, write_config, write_divergence, write_result
 
 # Beside the members' folders: how far all have come, and the state of the common random generator.
 STATE_FILE = "population.pt"
@@ -136,11 +137,14 @@ class BatchedRuns:
         done = [read_result(folder) for folder in self.folders]
         if all(result is not None and result["n_updates"] == self.total for result in done):
             return [result for result in done if result is not None]
-        with self._pool:
-            return self._run()
+        with self._pool, ExitStack() as stack:
+            population = self._population()
+            for folder in self.folders:
+                folder.mkdir(parents=True, exist_ok=True)
+                stack.enter_context(alone(folder))
+            return self._run(population)
 
-    def _run(self) -> list[dict[str, Any]]:
-        population = self._population()
+    def _run(self, population: Population) -> list[dict[str, Any]]:
         self._say_memory(population)
         started = time.monotonic() - self._seconds_before
         self._evaluate_again(population)
@@ -254,10 +258,10 @@ class BatchedRuns:
     def _save(self, population: Population, seconds: float) -> None:
         """All members, then the file that says so; what is older goes last. A kill at any point leaves a whole set."""
         n = population.n_updates
-        for model, folder in zip(population.models, self.folders, strict=True):
+        for index, (model, folder) in enumerate(zip(population.models, self.folders, strict=True)):
             model.num_timesteps = n
             if not self._diverged:
-                model.save(folder / _checkpoint(n))
+                self._save_member(index, model, folder / _checkpoint(n), n)
         if self._diverged:
             return  # a member that cannot be saved cannot be resumed: the last whole set stays
         with write_atomically(self._state_path) as stream:
@@ -267,11 +271,19 @@ class BatchedRuns:
                 if path.name != _checkpoint(n):
                     path.unlink()
 
+    def _save_member(self, index: int, model: OfflineAlgorithm, path: Path, n_updates: int) -> bool:
+        """Whether it could be saved: a moment that overflowed may show in no metric."""
+        try:
+            model.save(path)
+        except DivergenceError:
+            self._diverged[index] = n_updates
+            return False
+        return True
+
     def _finish(self, population: Population, seconds: float) -> list[dict[str, Any]]:
         results = []
         for index, (spec, model, folder) in enumerate(zip(self.specs, population.models, self.folders, strict=True)):
-            if index not in self._diverged:
-                model.save(folder / "model.zip")
+            if index not in self._diverged and self._save_member(index, model, folder / "model.zip", self.total):
                 results.append(write_result(spec, folder, read_evaluations(folder, catalogue_id(model.dataset)), seconds))
         self._state_path.unlink(missing_ok=True)
         for folder in self.folders:

@@ -6,6 +6,7 @@ import multiprocessing as mp
 import multiprocessing.connection
 import os
 import signal
+import sys
 import threading
 from types import FrameType
 
@@ -29,6 +30,7 @@ class UninterruptedBlock:
         if self._asked:
             signal.default_int_handler(number, frame)
         self._asked = True
+        print("Ending after this update; Ctrl-C again ends at once.", file=sys.stderr, flush=True)
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if self._replaced:

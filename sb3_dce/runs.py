@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from importlib.metadata import version
@@ -27,10 +27,10 @@ from sb3_dce.agents import agent_class
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.data import find_file
 from sb3_dce.data.hashes import sha256_once
-from sb3_dce.data.locking import exclusive
-from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError, DownloadError
+from sb3_dce.data.locking import held
+from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError
 from sb3_dce.evaluation import Evaluation, EvaluationCallback, catalogue_id, rollouts_of, write_evaluations
-from sb3_dce.files import write_atomically
+from sb3_dce.files import cannot_write, write_atomically
 
 OTHER_FOLDER = "Choose another folder with --out, or delete this one."
 BEGIN_ANEW = "Delete the run's folder to run it anew, or choose another one with --out."
@@ -117,28 +117,46 @@ def run(spec: RunSpec, report: Report = lambda progress: None) -> dict[str, Any]
     done = read_result(folder)
     if done is not None and done["n_updates"] == spec.n_updates:
         return done
+    seen = _stage(folder)
     model = _model(spec, folder)
     model.attach_dataset()
-    folder.mkdir(parents=True, exist_ok=True)  # not before: a run that is refused leaves nothing behind
-    with _alone(folder):
-        if (done := read_result(folder)) is not None and done["n_updates"] == spec.n_updates:
-            return done
+    try:
+        folder.mkdir(parents=True, exist_ok=True)  # not before: a run that is refused leaves nothing behind
+    except OSError as error:
+        raise cannot_write(folder, error) from error
+    with alone(folder):
+        if _stage(folder) != seen:  # another process was at it meanwhile
+            refuse_other_run(spec, folder)
+            if (done := read_result(folder)) is not None and done["n_updates"] == spec.n_updates:
+                return done
+            model = _model(spec, folder)
+            model.attach_dataset()
         return _train(spec, model, folder, report)
 
 
+def _stage(folder: Path) -> list[int | None]:
+    """Tells whether a run has moved on."""
+    paths = [folder / name for name in ("config.yml", "checkpoint.zip", "model.zip", "result.json", "diverged.json")]
+    return [path.stat().st_mtime_ns if path.is_file() else None for path in paths]
+
+
 @contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Two processes in one folder would mix their files."""
-    lock = exclusive(folder / ".lock", limit=0.0)
-    try:
-        lock.__enter__()
-    except DownloadError as error:
-        hint = "Wait for it, or take another --out. If that process is gone, delete the file .lock there."
-        raise CheckpointError(f"another process is at this run: {error.what}", where=str(folder), hint=hint) from error
-    try:
+def alone(folder: Path) -> Iterator[None]:
+    """
+    Hold the lock of a run: two processes in one folder would mix their files.
+
+    :param folder: of the run, existing
+    :raises CheckpointError: if another process is at it, or the folder cannot be written
+    """
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(held(folder / ".lock"))
+        except BlockingIOError as error:
+            hint = "Wait for it, or take another --out."
+            raise CheckpointError(f"another process is at this run: {error}", where=str(folder), hint=hint) from error
+        except OSError as error:
+            raise cannot_write(folder / ".lock", error) from error
         yield
-    finally:
-        lock.__exit__(None, None, None)
 
 
 def _train(spec: RunSpec, model: OfflineAlgorithm, folder: Path, report: Report) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 
 from sb3_dce import hyperparams
+from sb3_dce.checks import check_device, check_seed
 from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError, SB3DCEError
 from sb3_dce.files import write_atomically
 
@@ -25,18 +26,16 @@ DAMAGED = "The file is damaged or something else: give a zip file written by mod
 
 SelfSaving = TypeVar("SelfSaving", bound="SavingMixin")
 
-# Not in the zip: what is large, what can be made again, and what SB3 would pickle although nothing needs it.
 # Without these there is no model.
 MEMBERS = ("data", "policy.pth", "pytorch_variables.pth")
-# What reading a damaged file can end in; Stable-Baselines3 makes ValueErrors of some.
-UNREADABLE = (
-    *(zipfile.BadZipFile, zlib.error, pickle.UnpicklingError, EOFError, OSError, RuntimeError, NotImplementedError),
-    *(ValueError, LookupError, TypeError, AttributeError, RecursionError),
-)
+# What reading a damaged file can end in, and what a wrong argument or class can end in, too.
+READING = (zipfile.BadZipFile, zlib.error, pickle.UnpicklingError, EOFError, OSError, RuntimeError, LookupError)
+ARGUMENTS = (ValueError, TypeError, AttributeError)
 # Beginnings of its messages on arguments of ``load``, which are no damage.
 ABOUT_ARGUMENTS = ("The specified policy kwargs", "Observation spaces do not match", "Action spaces do not match")
 # Arguments that decide which rows of the data are trained on.
 CHOOSES_ROWS = frozenset({"fraction", "d4rl_compat"})
+# Not in the zip: what is large, what can be made again, and what SB3 would pickle although nothing needs it.
 EXCLUDED = (
     *("planned_updates", "_transitions", "_engine", "_generator", "_coef", "_metrics_read_at"),
     *("_last_obs", "_last_episode_starts", "_last_original_obs", "ep_info_buffer", "ep_success_buffer"),
@@ -114,26 +113,31 @@ class SavingMixin(OffPolicyAlgorithm):
             (changed) configuration
         """
         hyperparams.check_keys(cls, kwargs, where=f"{cls.__name__}.load")
+        check_seed(kwargs.get("seed"))
+        check_device(device)
         source, dataset = cls._own_file(path), kwargs.pop("dataset", None)
-        saved_seed = _saved_data(source).get("seed")
+        saved = _saved_data(source)
         _refuse_damage(source)
+        file_alone = env is None and not custom_objects and not kwargs
         try:
             model = super().load(source, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         except SB3DCEError:
             raise
-        except UNREADABLE as error:
+        except (*READING, *ARGUMENTS) as error:
             text = str(error).strip() or type(error).__name__
             if isinstance(error, ValueError) and text.startswith(ABOUT_ARGUMENTS):
                 raise ConfigError(text, where=_name_of(source), hint="Leave it out, or give what fits the model.") from error
-            raise CheckpointError(
-                f"the model cannot be read: {text.splitlines()[0][:200]}", where=_name_of(source), hint=DAMAGED
-            ) from error
+            if isinstance(error, ARGUMENTS) and not file_alone:
+                raise  # what was given may be at fault, and the file is whole
+            hint = "Its class has changed since it was saved, or the file is something else than model.save() writes."
+            what = f"the model cannot be read: {text.splitlines()[0][:200]}"
+            raise CheckpointError(what, where=_name_of(source), hint=hint) from error
         if not isinstance(model.dataset, str | None):
             raise CheckpointError(f"its dataset is {model.dataset!r}", where=_name_of(source), hint=DAMAGED)
-        _refuse_not_finite(model, CheckpointError, "the model cannot be used")
-        if kwargs.get("seed") not in (None, saved_seed):  # the saved state of the generator would go on regardless
+        _refuse_not_finite(model, CheckpointError, f"{_name_of(source)} cannot be used")
+        if kwargs.get("seed") not in (None, saved.get("seed")):  # the saved state of the generator would go on regardless
             model.set_random_seed(kwargs["seed"])
-        if CHOOSES_ROWS & set(kwargs):
+        if any(name in kwargs and kwargs[name] != saved.get(name) for name in CHOOSES_ROWS):
             model.dataset_statistics = None  # other rows are what was asked for
         if dataset is not None:
             model.set_dataset(dataset)  # type: ignore[attr-defined]  # AttachingMixin has it
@@ -222,7 +226,7 @@ def _saved_data(path: Path | io.BufferedIOBase) -> dict[str, Any]:
     try:
         with zipfile.ZipFile(path) as archive:
             saved = json.loads(archive.read("data"))
-    except (zipfile.BadZipFile, KeyError, ValueError, OSError) as error:
+    except (*READING, *ARGUMENTS) as error:
         found = None if isinstance(path, io.IOBase) else path
         raise CheckpointError(f"not a saved model ({error})", where=_name_of(path), path=found, hint=DAMAGED) from error
     if isinstance(path, io.IOBase):
@@ -237,7 +241,7 @@ def _refuse_damage(source: Path | io.BufferedIOBase) -> None:
     try:
         with zipfile.ZipFile(source) as archive:
             bad, missing = archive.testzip(), [name for name in MEMBERS if name not in archive.namelist()]
-    except UNREADABLE as error:
+    except (*READING, *ARGUMENTS) as error:
         raise CheckpointError(f"the model cannot be read: {error}", where=where, hint=DAMAGED) from error
     if bad is not None or missing:
         what = f"the part {bad!r} is damaged" if bad is not None else f"the part {missing[0]!r} is missing"
@@ -257,7 +261,7 @@ def _refuse_not_finite(model: Any, error: type[SB3DCEError], what: str) -> None:
             named += [(f"{name} ({key})", value) for state in states for key, value in state.items()]
     for name, tensor in named:
         if isinstance(tensor, th.Tensor) and not bool(th.isfinite(tensor).all()):
-            hint = "Go back to an earlier checkpoint; lower learning_rate or beta."
+            hint = "Go back to an earlier checkpoint; training needs a lower learning_rate or beta."
             raise error(f"{what}: {name} is not finite", key=name, hint=hint)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import random
@@ -10,20 +11,27 @@ import subprocess
 import sys
 import time
 import zipfile
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch as th
 from commands import sb3_dce
+from rich.console import Console
+from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_dce import OfflineDCE, OfflineIQL, files
-from sb3_dce.data.locking import exclusive
+from sb3_dce import OfflineDCE, OfflineIQL, files, runs, saving
+from sb3_dce.data.locking import exclusive, held
 from sb3_dce.errors import CheckpointError, ConfigError, DatasetWarning, DivergenceError
 from sb3_dce.evaluation import EvaluationCallback
 from sb3_dce.execution import Engine
+from sb3_dce.population import Population
+from sb3_dce.population_runs import BatchedRuns
 from sb3_dce.processes import UninterruptedBlock, threads_from_environment
-from sb3_dce.runs import RunSpec, read_result, run
+from sb3_dce.runs import RunSpec, alone, read_divergence, read_result, run
+from sb3_dce.saving import saved_algo
 
 TINY = "halfcheetah-tiny-sb3"
 SMALL: dict[str, Any] = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "execution": "eager"}
@@ -105,6 +113,32 @@ def test_arguments_that_do_not_fit_the_model_are_not_called_damage(saved: Path, 
         OfflineDCE.load(saved, policy_kwargs={"net_arch": [9]})
 
 
+def test_every_bit_of_the_directory_of_a_model(saved: Path, tmp_path: Path) -> None:
+    """Names, sizes, flags of the zip file: refused, or of no consequence; never another error."""
+    content = saved.read_bytes()
+    start = content.rindex(b"PK\x01\x02", 0, content.index(b"PK\x01\x02") + 4)
+    path, passed = tmp_path / "model.zip", 0
+    for offset in range(start, min(start + 120, len(content))):
+        for bit in range(8):
+            damaged = bytearray(content)
+            damaged[offset] ^= 1 << bit
+            path.write_bytes(damaged)
+            try:
+                saved_algo(path)
+                saving._refuse_damage(path)
+                passed += 1
+            except CheckpointError:
+                pass
+    assert passed < 500
+
+
+def test_wrong_arguments_are_not_called_damage(saved: Path) -> None:
+    for arguments in ({"device": "foo"}, {"seed": -1}, {"env": 5}, {"custom_objects": [1]}):
+        with pytest.raises(Exception) as caught:
+            OfflineDCE.load(saved, **arguments)  # type: ignore[arg-type]
+        assert not isinstance(caught.value, CheckpointError), arguments
+
+
 def test_numbers_that_are_not_finite_are_neither_saved_nor_loaded(saved: Path, tmp_path: Path) -> None:
     model = OfflineDCE.load_dataset(TINY, ent_coef="auto", **SMALL).learn(2)
     first = next(iter(model.actor.optimizer.state.values()))["exp_avg"]
@@ -161,11 +195,57 @@ def test_what_is_resumed_is_executed_as_it_was_begun(tmp_path: Path, monkeypatch
 
 def test_a_second_process_leaves_a_run_alone(tmp_path: Path) -> None:
     tmp_path.joinpath("run").mkdir()
-    with exclusive(tmp_path / "run" / ".lock"), pytest.raises(CheckpointError, match=r"another process is at this run.*--out"):
+    members = [spec(tmp_path / "run", 10), replace(spec(tmp_path / "other", 10), seed=1)]
+    with alone(tmp_path / "run"), pytest.raises(CheckpointError, match=r"another process is at this run: process \d+.*--out"):
         run(spec(tmp_path / "run", 10))
+    with alone(tmp_path / "run"), pytest.raises(CheckpointError, match="another process is at this run"):
+        BatchedRuns(members, th.device("cpu"), "eager", Console(quiet=True)).run()
     assert read_result(tmp_path / "run") is None
+    # whatever a process that is gone has written there: the system has freed its lock
+    (tmp_path / "run" / ".lock").write_text(json.dumps({"pid": os.getpid(), "host": "another", "started": "1"}))
     assert run(spec(tmp_path / "run", 10))["n_updates"] == 10
     assert not (tmp_path / "run" / ".lock").exists()
+
+
+def test_lock_of_a_killed_process_is_free(tmp_path: Path) -> None:
+    code = "import sys, time\nfrom pathlib import Path\nfrom sb3_dce.data.locking import held\n"
+    code += "with held(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)"
+    with subprocess.Popen([sys.executable, "-c", code, str(tmp_path / ".lock")], stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None and other.stdout.readline() == "held\n"
+        with pytest.raises(BlockingIOError, match=f"process {other.pid}"), held(tmp_path / ".lock"):
+            pass
+        other.kill()
+        other.wait()
+    with held(tmp_path / ".lock"):
+        pass
+    assert not (tmp_path / ".lock").exists()
+
+
+def test_run_that_another_process_completed_meanwhile_is_not_done_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = runs._model
+
+    def slow(asked: RunSpec, folder: Path) -> Any:
+        model = original(asked, folder)
+        monkeypatch.setattr(runs, "_model", original)
+        run(spec(tmp_path / "run", 20))
+        return model
+
+    monkeypatch.setattr(runs, "_model", slow)
+    with pytest.raises(ConfigError, match="n_updates=20 there, 10 now"):
+        run(spec(tmp_path / "run", 10))
+    result = read_result(tmp_path / "run")
+    assert result is not None and result["n_updates"] == 20
+
+
+def test_run_folder_that_cannot_be_written_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(path: Path) -> Any:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(runs, "held", full)
+    with pytest.raises(CheckpointError, match=r"cannot write: No space left on device.*free space"):
+        run(spec(tmp_path / "run", 10))
 
 
 def test_lock_of_a_process_whose_number_is_in_use_again_is_not_waited_for(tmp_path: Path) -> None:
@@ -194,9 +274,36 @@ def test_folder_that_cannot_be_written_is_said_before_training(tmp_path: Path) -
     assert model.num_timesteps == 0
 
 
+def test_member_whose_moments_overflowed_does_not_end_the_others(tmp_path: Path) -> None:
+    members = [replace(spec(tmp_path / str(seed), 20), seed=seed) for seed in range(2)]
+    batched = BatchedRuns(members, th.device("cpu"), "eager", Console(quiet=True))
+    original = Population.commit
+
+    def overflow(self: Population) -> Any:
+        models = original(self)
+        next(iter(models[1].critic.optimizer.state.values()))["exp_avg_sq"].fill_(float("inf"))
+        return models
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Population, "commit", overflow)
+        with pytest.raises(DivergenceError, match="1 of 2 members diverged"):
+            batched.run()
+    assert read_result(tmp_path / "0") is not None and read_result(tmp_path / "1") is None
+    assert read_divergence(tmp_path / "1") is not None
+
+
+@pytest.fixture
+def ctrl_c() -> Iterator[None]:
+    """Python's own handler, which a process in the background of a script does not have."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 # -- interruptions -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("ctrl_c")
 def test_ctrl_c_waits_for_the_end_of_an_update() -> None:
     steps: list[str] = []
     with pytest.raises(KeyboardInterrupt), UninterruptedBlock():
@@ -213,6 +320,7 @@ def test_ctrl_c_waits_for_the_end_of_an_update() -> None:
     assert steps == ["after the first"]
 
 
+@pytest.mark.usefixtures("ctrl_c")
 def test_interrupted_model_is_whole_and_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     model, straight = (OfflineIQL.load_dataset(TINY, seed=0, actor_lr_schedule="constant", **SMALL) for _ in range(2))
     straight.learn(20, log_interval=None)
@@ -240,6 +348,20 @@ def test_interrupted_model_is_whole_and_goes_on(monkeypatch: pytest.MonkeyPatch)
         assert steps == {float(model._n_updates)} and model.num_timesteps == model._n_updates
     assert interruptions == 6
     assert all(th.equal(a, b) for a, b in zip(model.policy.parameters(), straight.policy.parameters(), strict=True))
+
+
+@pytest.mark.usefixtures("ctrl_c")
+def test_counters_agree_after_an_interruption_in_a_callback() -> None:
+    class Stop(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 13:
+                raise KeyboardInterrupt
+            return True
+
+    model = OfflineDCE.load_dataset(TINY, gradient_steps=10, **SMALL)
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(40, Stop())
+    assert model.num_timesteps == model._n_updates == 20
 
 
 def test_what_killed_writers_left_is_removed_by_the_next_one(tmp_path: Path) -> None:

@@ -134,7 +134,9 @@ def test_model_goes_on_with_the_statistics_it_was_trained_with(
     loaded.set_dataset(other)
     loaded.learn(2)
     assert np.array_equal(loaded.get_vec_normalize_env().obs_rms.mean, mean)
-    for fresh in (wrapped(), wrapped(norm_obs=False)):
+    looked = wrapped()
+    looked.reset()
+    for fresh in (wrapped(), wrapped(norm_obs=False), looked):
         wrong = OfflineDCE.load(tmp_path / "model.zip", env=fresh)
         wrong.set_dataset(transitions)
         with pytest.raises(ConfigError, match="whose statistics are not here"):

@@ -205,6 +205,12 @@ def test_an_agent_that_diverges_has_failed() -> None:
     assert one_of(outcomes("table1", results.merge(parts)), "C4") == NOT_HELD
 
 
+def test_nothing_is_said_where_all_diverged() -> None:
+    names = [v.name for v in load_experiment("fig-tau").variants]
+    found = outcomes("fig-tau", results.merge(lost("fig-tau", name) for name in names))
+    assert one_of(found, "little difference on half") == UNTESTED
+
+
 def test_q_of_sac_that_diverged_is_compared_with_runs_that_are_there() -> None:
     sac = lost("fig-sac", "SAC, alpha 1")
     assert one_of(outcomes("fig-sac", sac), "far lower (paper: 4000 and 400), alpha 1") == UNTESTED

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import os
 import socket
+import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TextIO
 
 from sb3_dce.errors import DownloadError
 
@@ -47,7 +49,68 @@ def exclusive(path: Path, *, limit: float = 3600.0, note: Callable[[str], None] 
     try:
         yield
     finally:
-        path.unlink(missing_ok=True)
+        if _read(path) == _own():  # not that of another one, if somebody has deleted ours
+            path.unlink(missing_ok=True)
+
+
+@contextmanager
+def held(path: Path) -> Iterator[None]:
+    """
+    Hold a lock that the system frees when the process ends, however it ends; nobody waits for it.
+
+    :param path: lock file, in an existing folder; it is removed at the end
+    :raises BlockingIOError: if another process holds it; its text is the owner
+    :raises OSError: if the folder cannot be written
+    """
+    while True:
+        file = open(path, "a+", encoding="utf-8")
+        try:
+            if not _lock(file):
+                raise BlockingIOError(_owner(path))
+            if _same_file(file, path):
+                break
+        except BaseException:
+            file.close()
+            raise
+        file.close()  # its owner has just removed it
+    with file:
+        file.truncate(0)
+        json.dump({"pid": os.getpid(), "host": socket.gethostname()}, file)
+        file.flush()
+        try:
+            yield
+        finally:
+            with suppress(OSError):  # Windows removes no open file
+                path.unlink(missing_ok=True)
+
+
+def _lock(file: TextIO) -> bool:
+    """Whether the lock is ours now; also where the file system has none, as some network disks."""
+    if sys.platform == "win32":
+        import msvcrt
+
+        file.seek(2**20)  # beyond the text, which others may read
+        try:
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        except OSError:
+            return False
+        return True
+    import fcntl
+
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass
+    return True
+
+
+def _same_file(file: TextIO, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except FileNotFoundError:
+        return False
 
 
 def _create(path: Path) -> bool:
@@ -55,16 +118,28 @@ def _create(path: Path) -> bool:
         descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
     except FileExistsError:
         return False
-    with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-        json.dump({"pid": os.getpid(), "host": socket.gethostname(), "started": _started(os.getpid())}, file)
+    pid, host, started = _own()
+    try:
+        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+            json.dump({"pid": pid, "host": host, "started": started}, file)
+    except OSError:
+        path.unlink(missing_ok=True)
+        raise
     return True
 
 
+def _own() -> tuple[int, str, str | None]:
+    return os.getpid(), socket.gethostname(), _started(os.getpid())
+
+
 def _started(pid: int) -> str | None:
-    """When a process began, in the kernel's clock: a number may be in use again. None where the system does not tell."""
+    """
+    When a process began, in the kernel's clock: a number may be in use again. None where the system does not tell; "dead" for
+    one that has ended and was not asked for its result.
+    """
     try:
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
-        return fields[19]
+        return "dead" if fields[0] in ("Z", "X") else fields[19]
     except (OSError, IndexError):
         return None
 
@@ -94,8 +169,8 @@ def _is_abandoned(path: Path) -> bool:
         os.kill(pid, 0)
     except (ProcessLookupError, OverflowError):
         return True
-    except PermissionError:  # it lives, as another user
-        return False
+    except PermissionError:  # a process of another user has this number
+        pass
     now = _started(pid)
     other = started is not None and now is not None and started != now
     return other or pid <= 0  # no process has such a number

@@ -219,7 +219,7 @@ def _tau(evidence: Evidence) -> list[Verdict]:
     for dataset, little in (("halfcheetah-medium-v2", True), ("relocate-cloned-v0", False), ("kitchen-mixed-v0", False)):
         values = values_of(evidence, names, "score", dataset)
         holds: bool | str | None = None
-        if values is not None:
+        if values is not None and max(values.values()) > -math.inf:
             spread = max(values.values()) - min(values.values())
             by_chance = RANGE_OF_FIVE * float(np.mean(list(values.errors.values())))
             holds = little if spread < LITTLE else CLOSE if spread <= by_chance else not little
