@@ -28,6 +28,10 @@ from sb3_dce.launch import launch_all
 from sb3_dce.plots import plot_learning_curves
 from sb3_dce.runs import RunSpec, check_before_running, read_divergence, read_result
 
+BANDS = (
+    "Thick: mean over seeds; thin: each seed; bands: 95 % confidence interval of the mean (Student's t) from three seeds on, "
+    "the range of two."
+)
 COLUMNS = ("agent", "seed", "n_updates", "mean_return", "normalized_score", "seconds", "seconds_per_1000", "overrides")
 
 
@@ -246,7 +250,7 @@ def _write_markdown(path: Path, title: str, lines: list[list[str]], notes: list[
     text = [f"# Agents on {title}", "", *(f"| {' | '.join(line)} |" for line in (lines[0], rule, *lines[1:])), ""]
     text += [" ".join(["Last evaluation of each run; the seconds are wall time, evaluations included.", *notes]), ""]
     if picture is not None:
-        text += [f"![Learning curves]({picture.name})", ""]
+        text += [f"![Learning curves]({picture.name})", "", BANDS, ""]
     with write_atomically(path) as stream:
         stream.write("\n".join(text).encode())
 

@@ -153,7 +153,9 @@ def _seeds_matter(evidences: list[Evidence]) -> Verdict:
                 spreads[name] = (sample_std(scores), lengths_and_seeds(evidence, dce, [name]))
     widest = sorted(spreads.items(), key=lambda item: -item[1][0])[:3]
     numbers = Values((f"{name}, {scope}", spread) for name, (spread, scope) in widest).text()
-    holds = widest[0][1][0] > 10.0 if widest else None
+    holds: bool | None = bool(widest) and widest[0][1][0] > 10.0
+    if not holds and not any(name.startswith(("hopper-medium", "pen-human")) for name in spreads):
+        holds = None  # nothing was run on the kinds of data that the paper names
     rule = "a standard deviation over seeds above 10"
     claim = "seeds matter (paper: 12.3 on hopper-medium, 18.4 on hopper-medium-expert, 37 on pen-human)"
     return judge(claim, rule, holds, numbers)
