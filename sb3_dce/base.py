@@ -349,8 +349,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         :param batch_size: rows per step
         """
         self.attach_dataset()
-        buffer = self.replay_buffer
-        assert isinstance(buffer, OfflineReplayBuffer)
+        buffer = self._own_buffer()
         self.policy.set_training_mode(True)  # evaluation leaves the policy in evaluation mode
         planned = max(self._total_timesteps - self.num_timesteps, gradient_steps)
         engine = self._bound_engine(self.planned_updates or planned)

@@ -53,11 +53,15 @@ def _remove_abandoned(target: pathlib.Path) -> None:
     for path in target.parent.glob(f".{glob.escape(target.name)}.*.tmp"):
         pid = path.name.removeprefix(f".{target.name}.").partition(".")[0]
         with contextlib.suppress(OSError):
-            if pid.isdecimal() and not _lives(int(pid)) and time.time() - path.stat().st_mtime > ABANDONED_SECONDS:
+            if pid.isdecimal() and not process_lives(int(pid)) and time.time() - path.stat().st_mtime > ABANDONED_SECONDS:
                 path.unlink()
 
 
-def _lives(pid: int) -> bool:
+def process_lives(pid: int) -> bool:
+    """
+    :param pid: number of a process of this machine
+    :return: whether there is one, of whichever user; always true on Windows, where nothing can be asked without harm
+    """
     if os.name == "nt":  # os.kill would end it
         return True
     try:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TextIO
 
 from sb3_dce.errors import DownloadError
+from sb3_dce.files import process_lives
 
 POLL_SECONDS = 0.1
 # Between looking at a dead process's lock and removing it; who dies in between leaves this file behind.
@@ -75,7 +76,7 @@ def held(path: Path) -> Iterator[None]:
         file.close()  # its owner has just removed it
     with file:
         file.truncate(0)
-        json.dump({"pid": os.getpid(), "host": socket.gethostname()}, file)
+        _write_owner(file)
         file.flush()
         try:
             yield
@@ -118,14 +119,18 @@ def _create(path: Path) -> bool:
         descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
     except FileExistsError:
         return False
-    pid, host, started = _own()
     try:
         with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-            json.dump({"pid": pid, "host": host, "started": started}, file)
+            _write_owner(file)
     except OSError:
         path.unlink(missing_ok=True)
         raise
     return True
+
+
+def _write_owner(file: TextIO) -> None:
+    pid, host, started = _own()
+    json.dump({"pid": pid, "host": host, "started": started}, file)
 
 
 def _own() -> tuple[int, str, str | None]:
@@ -163,14 +168,10 @@ def _is_abandoned(path: Path) -> bool:
     if owner is None:  # a process that dies before it has written its name leaves an empty lock
         return _age(path) > _TAKEOVER_SECONDS
     pid, host, started = owner
-    if host != socket.gethostname() or os.name == "nt":  # on Windows os.kill would end the process
+    if host != socket.gethostname():
         return False
-    try:
-        os.kill(pid, 0)
-    except (ProcessLookupError, OverflowError):
+    if not process_lives(pid):
         return True
-    except PermissionError:  # a process of another user has this number
-        pass
     now = _started(pid)
     other = started is not None and now is not None and started != now
     return other or pid <= 0  # no process has such a number

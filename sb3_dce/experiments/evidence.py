@@ -110,7 +110,7 @@ class Evidence:
         :return: how the data that stand for it differ in kind from it; empty if they do not
         """
         dataset = self.entry(paper)
-        return (dataset.note or "of another kind") if dataset.other_kind and self.id_of(paper) == dataset.twin else ""
+        return (dataset.note or "of another kind") if dataset.is_other_kind(self.id_of(paper)) else ""
 
     def scope(self, dataset_id: str, variants: Iterable[Variant]) -> str:
         """

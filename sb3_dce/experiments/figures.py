@@ -104,6 +104,15 @@ def _save(figure: Figure, folder: Path, name: str) -> list[Path]:
     return paths
 
 
+def variants_of(evidence: Evidence, panel: Panel) -> tuple[str, ...]:
+    """
+    :param evidence: rows
+    :param panel: picture
+    :return: names of the variants that belong into it
+    """
+    return panel.variants or tuple(v.name for v in evidence.experiment.variants)
+
+
 def panel_curves(evidence: Evidence, panel: Panel) -> dict[str, tuple[pd.DataFrame, pd.Series | None]]:
     """
     :param evidence: rows
@@ -111,7 +120,7 @@ def panel_curves(evidence: Evidence, panel: Panel) -> dict[str, tuple[pd.DataFra
     :return: by line its curves (steps by seeds) and, where there is one, what theory expects; lines without data are left out
     """
     experiment = evidence.experiment
-    names = panel.variants or tuple(v.name for v in experiment.variants)
+    names = variants_of(evidence, panel)
     curves: dict[str, tuple[pd.DataFrame, pd.Series | None]] = {}
     if panel.over:
         for paper in panel.over:
@@ -207,7 +216,7 @@ def _missing(evidence: Evidence, panel: Panel, curves: dict[str, tuple[pd.DataFr
         return [name for name in panel.over if evidence.id_of(name) not in curves]
     if panel.lines:
         return []
-    return [name for name in panel.variants or tuple(v.name for v in evidence.experiment.variants) if name not in curves]
+    return [name for name in variants_of(evidence, panel) if name not in curves]
 
 
 def _absence(evidence: Evidence, panel: Panel) -> str:

@@ -75,6 +75,13 @@ class GridDataset:
         """
         return (self.paper,) if self.twin is None else (self.paper, self.twin)
 
+    def is_other_kind(self, dataset_id: str | None) -> bool:
+        """
+        :param dataset_id: one of :attr:`ids`, ``None`` without results
+        :return: whether these data are of another kind than the paper's
+        """
+        return self.other_kind and dataset_id == self.twin
+
     @property
     def absence(self) -> str:
         """

@@ -10,7 +10,7 @@ from sb3_dce.dce import OfflineDCE
 from sb3_dce.experiments import diagnosis, tables
 from sb3_dce.experiments.configuration import row_of
 from sb3_dce.experiments.evidence import Evidence
-from sb3_dce.experiments.figures import panel_curves
+from sb3_dce.experiments.figures import panel_curves, variants_of
 from sb3_dce.experiments.grid import Variant, source_of
 from sb3_dce.experiments.judging import CLOSE, HELD, NOT_HELD, UNTESTED, Verdict, judge
 from sb3_dce.experiments.paper import paper_score, read_csv
@@ -87,14 +87,13 @@ def drawn_in(evidence: Evidence) -> tuple[list[str], list[Variant]] | None:
     names: set[str] = set()
     for panel in experiment.panels:
         curves = panel_curves(evidence, panel)
-        shown = panel.variants or tuple(v.name for v in experiment.variants)
         if panel.over:
             ids.update(curves)
         elif curves:
             ids.update(name for name in [evidence.id_of(panel.dataset)] if name is not None)
         if curves:
             # lines of one variant (over data sets, or critics of the probe) have names of their own
-            names.update(shown[:1] if panel.over or panel.lines else curves)
+            names.update(variants_of(evidence, panel)[:1] if panel.over or panel.lines else curves)
             names.update([panel.reference] if panel.reference else [])
     if not ids:
         return None

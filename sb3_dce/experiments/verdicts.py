@@ -440,7 +440,7 @@ def _adroit(evidence: Evidence) -> list[Verdict]:
     pairs, spreads = {}, Values()
     for dataset, name in evidence.table_rows():
         scores = [evidence.last(v, name) for v in (with_, without)]
-        same_kind = not (dataset.other_kind and name == dataset.twin)
+        same_kind = not dataset.is_other_kind(name)
         human = dataset.paper in (without.datasets or ()) and same_kind
         if human and all(map(len, scores)):
             pairs[name] = (scores[0], scores[1])
