@@ -1,4 +1,4 @@
-"""The command line of data: ``sb3-dce datasets list | info | check | report | download``."""
+"""The command line of data: ``sb3-dce datasets list | info | compare | check | report | download``."""
 
 from __future__ import annotations
 
@@ -16,12 +16,14 @@ from sb3_dce import cli_recording
 
 if TYPE_CHECKING:
     from sb3_dce.data.advice import Check
+    from sb3_dce.data.transitions import Transitions
 
 app = typer.Typer(help="What data there are, and what is in them.", no_args_is_help=True)
 app.command("record")(cli_recording.record_dataset)
 app.command("generate")(cli_recording.generate_dataset)
 
 console = Console(highlight=False)
+SHOWN_REASONS = 10
 DatasetArgument = Annotated[
     str, typer.Argument(help="Id such as [b]walker2d-medium[/b] or [b]minari:D4RL/door/human-v2[/b], or a file.")
 ]
@@ -61,16 +63,60 @@ def list_datasets(
 
 
 @app.command("info")
-def dataset_info(dataset: DatasetArgument) -> None:
+def dataset_info(
+    dataset: DatasetArgument,
+    card: Annotated[
+        Path | None, typer.Option(show_default=False, help="Also write what [b]datasets compare[/b] needs, a small JSON file.")
+    ] = None,
+) -> None:
     """Read a dataset, check it, and say what is in it."""
-    from sb3_dce.data import load_transitions
+    from sb3_dce.data.comparison import DatasetCard
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # they are part of the summary
-        transitions = load_transitions(dataset)
+    transitions = _read_quietly(dataset)
     for line in transitions.summary():
         console.print(line, markup=False)
     console.print(f"sha256 {transitions.info.sha256}")
+    if card is not None:
+        DatasetCard.of(transitions).write(card)
+        console.print(f"card   {card}", markup=False)
+
+
+@app.command("compare")
+def compare_two_datasets(
+    first: DatasetArgument,
+    second: Annotated[str, typer.Argument(help="Another, or the JSON card that [b]datasets info --card[/b] wrote of it.")],
+) -> None:
+    """
+    Say whether two datasets are identical, statistically equal (samples of the same thing), or different.
+
+    For data that were made again on another machine, whose bits differ. The exit code is 1 if they are different.
+    """
+    from sb3_dce.data.comparison import DIFFERENT, DatasetCard, compare_datasets
+    from sb3_dce.data.minari import METADATA_FILE
+
+    def card_of(name: str) -> DatasetCard:
+        is_card = name.endswith(".json") and Path(name).name != METADATA_FILE
+        return DatasetCard.read(name) if is_card else DatasetCard.of(_read_quietly(name))
+
+    cards = [card_of(first), card_of(second)]
+    comparison = compare_datasets(*cards)
+    for card in cards:
+        console.print(f"{card.id}: {card.rows:,} transitions, {card.episodes:,} whole episodes", markup=False)
+    for reason in comparison.reasons[:SHOWN_REASONS]:
+        console.print(reason, markup=False)
+    if len(comparison.reasons) > SHOWN_REASONS:
+        console.print(f"and {len(comparison.reasons) - SHOWN_REASONS} more")
+    console.print(comparison.sentence(), markup=False)
+    raise typer.Exit(int(comparison.verdict == DIFFERENT))
+
+
+def _read_quietly(dataset: str) -> Transitions:
+    """Warnings of the reader are part of the summary."""
+    from sb3_dce.data import load_transitions
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return load_transitions(dataset)
 
 
 @app.command("check")

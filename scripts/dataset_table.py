@@ -116,9 +116,11 @@ def page(folder: Path, machine: str) -> str:
         "# Generated datasets",
         "",
         "Made with `sb3-dce datasets generate <id> --policies <folder>` (`--rows 100000` for the Adroit expert sets), one "
-        "process, seed 0, by `python scripts/dataset_table.py`. They stand in for D4RL's sets and are not these: scores "
-        "reached with them cannot be compared with published ones. Scores have D4RL's constants; returns are those of the "
-        "v4 locomotion environments, and of Adroit with the corrections of this package.",
+        "process, seed 0, by `python scripts/dataset_table.py`. The policies named `own run` are not published; without them "
+        "`generate` trains such a policy anew, which gives other data of the same kind. The others are public: give their "
+        "zip files with `--policy`. The sets stand in for D4RL's and are not these: scores reached with them cannot be "
+        "compared with published ones. Scores have D4RL's constants; returns are those of the v4 locomotion environments, "
+        "and of Adroit with the corrections of this package.",
         "",
         f"{first['versions']}; {machine}.",
         "",
@@ -130,19 +132,24 @@ def page(folder: Path, machine: str) -> str:
         "per processor second include loading, compressing and writing; `benchmarks/results/recording.md` has those of the "
         "present recorder by itself. Joined and copied sets record no steps.",
         "",
+        "The training results in this repository were made on files that were written at other times, some from other numbers "
+        "of rows: `halfcheetah-medium-sb3` of 500 episodes (sha256 `9a761263…`), `halfcheetah-medium-expert-sb3` of 500 and "
+        "500, and the buffers of the `-replay-` sets before they were copied into this layout (the same steps). Results name "
+        "the hash, not only the id; [cards](cards) of these files are what `sb3-dce datasets compare` wants.",
+        "",
         "## Where they come from",
         "",
         "| id | behaviour policy | source | licence | SHA-256 of the file |",
         "|---|---|---|---|---|",
         *(source_row(dataset_id, folder) for dataset_id in made),
         "",
-        "`hopper-medium-replay-sb3` is not among them: the run of SAC at hand was stopped at D4RL's 402,000 steps with a "
-        "return of 732, below the medium level of 1422. Its buffer keeps the honest name `hopper-replay-402k-sb3`. "
+        "`hopper-medium-replay-sb3` is not among them: the run of SAC that this buffer comes from was stopped at D4RL's "
+        "402,000 steps with a return of 732, below the medium level of 1422. Its buffer keeps the honest name `hopper-replay-402k-sb3`. "
         "`sb3-dce datasets generate hopper-medium-replay-sb3` trains SAC until that level is reached.",
         "",
-        "The hashes are those of this machine: another version of the simulator or other vector instructions change the "
-        "last bits of a simulation, and then the whole episode. `content_hash` in a file's attributes does not depend "
-        "on compression.",
+        "The hashes hold for the versions named above and one kind of processor: another version of the simulator or other "
+        "vector instructions change the last bits of a simulation, and then the whole episode. `content_hash` in a file's "
+        "attributes is independent of compression.",
     ]
     return "\n".join(lines)
 
