@@ -432,10 +432,10 @@ def update(
         q_all = nets["critic"](params, th.cat([s] * (1 + n_pen)), th.cat([a, a_pen]), masks)
         q_data, q_pen = [q[:n] for q in q_all], [q[n:] for q in q_all]
         penalty = _penalty(options, q_data, q_pen, values, coef["beta"])
-        return losses.critic_loss(q_data, y, coef["td_loss_coef"]) + penalty, (q_data, q_pen)
+        return losses.critic_loss(q_data, y, coef["td_loss_coef"]) + penalty, (q_data, q_pen, penalty)
 
-    new["critic"], loss, (q_data, q_pen), norm = descend(q_loss, state["critic"], lr, settings["critic"], clip)
-    metrics.update(critic_loss=loss, grad_norm_q=norm, value_next=next_values.mean(), td_target=y.mean())
+    new["critic"], loss, (q_data, q_pen, penalty), norm = descend(q_loss, state["critic"], lr, settings["critic"], clip)
+    metrics.update(critic_loss=loss, grad_norm_q=norm, penalty=penalty, value_next=next_values.mean(), td_target=y.mean())
     metrics.update(_critic_metrics(q_data, q_pen, y, coef))
 
     # 3 targets
@@ -549,7 +549,6 @@ def _critic_metrics(
         "q_gap": penalised.mean() - data.mean(),
         "td_mse": (data - y).square().mean(),
         "gap_td": (data - y).mean() + coef["beta_eff"],
-        "penalty": coef["beta"] * penalised.mean(),
         "beta": coef["beta"],
         "beta_eff": coef["beta_eff"],
         "twin_gap": (data.max(dim=-1).values - data.min(dim=-1).values).mean(),

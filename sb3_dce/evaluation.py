@@ -17,9 +17,10 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_dce.checks import check_number
 from sb3_dce.data.catalog import normalized_score, resolve
+from sb3_dce.data.locate import known_dataset
 from sb3_dce.data.minari import is_minari_name
 from sb3_dce.envs import make_env_if_possible, make_minari_env, missing_simulator
-from sb3_dce.errors import CheckpointError, DatasetError
+from sb3_dce.errors import CheckpointError
 from sb3_dce.evaluation_pool import EvaluationPool
 from sb3_dce.files import check_writable, write_atomically
 from sb3_dce.rollouts import Rollouts, deterministic_act
@@ -71,12 +72,8 @@ def catalogue_id(dataset: str | None) -> str | None:
     :param dataset: id or file name
     :return: id of the catalogue, ``None`` if it is not in there
     """
-    if dataset is None:
-        return None
-    try:
-        return resolve(Path(dataset).stem if dataset.endswith((".hdf5", ".h5")) else dataset).id
-    except DatasetError:
-        return None
+    spec = None if dataset is None else known_dataset(dataset)
+    return None if spec is None else spec.id
 
 
 def make_rollouts(dataset_id: str, n_episodes: int, n_envs: int | None = None) -> Rollouts | None:

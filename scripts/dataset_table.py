@@ -144,8 +144,9 @@ def page(folder: Path, machine: str) -> str:
         *(source_row(dataset_id, folder) for dataset_id in made),
         "",
         "`hopper-medium-replay-sb3` is not among them: the run of SAC that this buffer comes from was stopped at D4RL's "
-        "402,000 steps with a return of 732, below the medium level of 1422. Its buffer keeps the honest name `hopper-replay-402k-sb3`. "
-        "`sb3-dce datasets generate hopper-medium-replay-sb3` trains SAC until that level is reached.",
+        "402,000 steps with a return of 732, below the medium level of 1422. Its buffer keeps the honest name "
+        "`hopper-replay-402k-sb3`. `sb3-dce datasets generate hopper-medium-replay-sb3` trains SAC until that level is "
+        "reached.",
         "",
         "The hashes hold for the versions named above and one kind of processor: another version of the simulator or other "
         "vector instructions change the last bits of a simulation, and then the whole episode. `content_hash` in a file's "

@@ -10,8 +10,9 @@ import pytest
 
 from sb3_dce.data import all_specs, available, find_file, normalized_score, resolve, spec_of_file
 from sb3_dce.data.catalog import D4RL_URL
-from sb3_dce.data.locate import cache_folder, is_path
+from sb3_dce.data.locate import cache_folder, is_path, known_dataset
 from sb3_dce.errors import DatasetError, DatasetNotFoundError
+from sb3_dce.evaluation import catalogue_id
 from sb3_dce.hyperparams import load_row
 
 
@@ -64,6 +65,25 @@ def test_generated_data_never_carry_an_official_id() -> None:
 )
 def test_aliases_complete_the_version(name: str, dataset_id: str) -> None:
     assert resolve(name).id == dataset_id
+
+
+@pytest.mark.parametrize(
+    ("name", "dataset_id"),
+    [
+        ("pen-human", "pen-human-v0"),
+        ("folder/pen-v0_demos_clipped.hdf5", "pen-human-v0"),
+        ("folder/halfcheetah-medium-sb3.npz", "halfcheetah-medium-sb3"),
+        ("hopper-medium-v2.csv", "hopper-medium-v2"),
+        ("hopper-medium.hdf5", None),  # an alias is no claim of a file to be D4RL's
+        ("minari:someone/hopper-medium-v2", None),
+        ("mine", None),
+    ],
+)
+def test_data_and_evaluation_agree_on_what_a_name_stands_for(name: str, dataset_id: str | None, empty_machine: Path) -> None:
+    spec = known_dataset(name)
+    assert getattr(spec, "id", None) == catalogue_id(name) == dataset_id
+    if "/" in name and not name.startswith("minari:"):
+        assert find_file(touch(empty_machine / name))[1] == spec
 
 
 def test_unknown_name_lists_close_matches() -> None:

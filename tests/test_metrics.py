@@ -39,12 +39,21 @@ def test_diagnostics_of_dce_are_what_their_names_say(transitions: Transitions, m
         y = b.rewards + model.gamma * (1 - b.dones) * before.v(model.value_net, b.next_observations)  # V after its step
     expected = {
         **{"q_data": q.mean(), "q_data_min": q.min(), "q_data_max": q.max(), "q0_data": q[:, 0].mean()},
-        **{"q_policy": q_pi.mean(), "q_gap": q_pi.mean() - q.mean(), "penalty": 3.0 * q_pi.mean()},
+        **{"q_policy": q_pi.mean(), "q_gap": q_pi.mean() - q.mean(), "penalty": 3.0 * q_pi.mean(dim=0).sum()},
         **{"twin_gap": (q[:, 0] - q[:, 1]).abs().mean(), "td_mse": ((q - y) ** 2).mean(), "gap_td": (q - y).mean() + 1.5},
         **{"adv": adv.mean(), "adv_pos_frac": (adv > 0).double().mean(), "td_target": y.mean(), "entropy": -log_prob.mean()},
         **{"action_sat": (a_pi.abs() > 0.99).double().mean(), "action_dist": (a_pi - a).abs().mean()},
     }
     assert {name: got[name] for name in expected} == pytest.approx({k: float(v) for k, v in expected.items()}, abs=1e-12)
+
+
+@pytest.mark.parametrize("penalty", [{}, {"penalty_form": "hinge"}, {"penalty_form": "cql"}, {"penalty_floor": 0.0}])
+def test_logged_penalty_is_the_penalty_of_the_loss(transitions: Transitions, penalty: dict[str, Any]) -> None:
+    model = make_dce(transitions, beta=2.0, td_loss_coef=0.5, **penalty)
+    model.train(1, BATCH)
+    got = model.read_metrics()
+    n_critics = model.critic.n_critics
+    assert got["critic_loss"] == pytest.approx(0.5 * n_critics * got["td_mse"] + got["penalty"], rel=1e-12)
 
 
 def one_step(model: OfflineAlgorithm, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Any, dict[str, float]]:

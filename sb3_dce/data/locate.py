@@ -34,8 +34,8 @@ def find_file(name_or_path: str | PathLike[str]) -> tuple[Path, DatasetSpec | No
     """
     if is_minari_name(name_or_path):
         return find_minari(name_or_path).file, None
-    path = Path(name_or_path).expanduser()
     if is_path(name_or_path):
+        path = Path(name_or_path).expanduser()
         if not path.exists():
             raise DatasetNotFoundError("no such file", where=str(path), hint=_available_hint(), path=path)
         return path, spec_of_file(path)
@@ -44,6 +44,23 @@ def find_file(name_or_path: str | PathLike[str]) -> tuple[Path, DatasetSpec | No
     if found is None:
         raise _not_found(spec)
     return found, spec
+
+
+def known_dataset(name_or_path: str | PathLike[str]) -> DatasetSpec | None:
+    """
+    The entry of the catalogue that :func:`find_file` would give, whether the file is here or not.
+
+    :param name_or_path: file, id or alias of the catalogue, or ``minari:`` and an id of Minari
+    :return: entry of the catalogue, ``None`` if the name or the file name is not known there
+    """
+    if is_minari_name(name_or_path):
+        return None
+    if is_path(name_or_path):
+        return spec_of_file(name_or_path)
+    try:
+        return resolve(os.fspath(name_or_path))
+    except DatasetError:
+        return None
 
 
 def is_path(name_or_path: str | PathLike[str]) -> bool:

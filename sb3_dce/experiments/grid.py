@@ -22,8 +22,8 @@ import yaml
 from sb3_dce import hyperparams
 from sb3_dce.agents import agent_class
 from sb3_dce.data.catalog import resolve
-from sb3_dce.data.locate import search
-from sb3_dce.errors import ConfigError, DatasetError, DatasetNotFoundError
+from sb3_dce.data.locate import known_dataset, search
+from sb3_dce.errors import ConfigError, DatasetNotFoundError
 from sb3_dce.experiments.configuration import config_hash, defaults_of, differences, row_of
 from sb3_dce.runs import RunSpec
 
@@ -333,10 +333,8 @@ def _chosen(experiment: Experiment, datasets: Sequence[str] | None) -> list[Grid
     by_id = {name: d for d in experiment.datasets for name in d.ids}
     wanted = []
     for name in datasets:
-        try:
-            wanted.append(resolve(name).id)
-        except DatasetError:
-            wanted.append(name)
+        spec = known_dataset(name)
+        wanted.append(name if spec is None else spec.id)
         if wanted[-1] not in by_id:
             hint = f"It has {', '.join(by_id)}; present, by itself, takes those that are here."
             raise ConfigError(f"{experiment.id} has no dataset {wanted[-1]!r}", key="--datasets", hint=hint)

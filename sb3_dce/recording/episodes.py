@@ -19,9 +19,10 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_dce.data.catalog import DatasetSpec, all_specs, resolve
+from sb3_dce.data.catalog import DatasetSpec, all_specs
+from sb3_dce.data.locate import known_dataset
 from sb3_dce.envs import make_env_if_possible, missing_simulator, without_bookkeeping
-from sb3_dce.errors import ConfigError, DatasetError, DatasetSemanticsError
+from sb3_dce.errors import ConfigError, DatasetSemanticsError
 from sb3_dce.numpy_policy import NumpyPolicy
 from sb3_dce.recording.policy_files import PolicyFacts, load_policy
 
@@ -270,10 +271,8 @@ def dataset_of_env(env_id: str) -> DatasetSpec | None:
     :param env_id: id of Gymnasium, or id or alias of the catalogue
     :return: entry of the catalogue, ``None`` if there is none
     """
-    try:
-        return resolve(env_id)
-    except DatasetError:
-        return next((spec for spec in all_specs() if spec.env_id == env_id and spec.family == "gym"), None)
+    by_env = (spec for spec in all_specs() if spec.env_id == env_id and spec.family == "gym")
+    return known_dataset(env_id) or next(by_env, None)
 
 
 def concatenate(parts: Sequence[Arrays]) -> Arrays:

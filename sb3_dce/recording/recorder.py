@@ -21,11 +21,12 @@ from typing import Any
 import numpy as np
 
 import sb3_dce
-from sb3_dce.data.catalog import DatasetSpec, normalized_score, resolve, spec_of_file
+from sb3_dce.data.catalog import normalized_score, spec_of_file
 from sb3_dce.data.hashes import content_hash
 from sb3_dce.data.hdf5 import write_hdf5
+from sb3_dce.data.locate import known_dataset
 from sb3_dce.data.records import bounds_attribute
-from sb3_dce.errors import ConfigError, DatasetError, SB3DCEError
+from sb3_dce.errors import ConfigError, SB3DCEError
 from sb3_dce.files import check_writable
 from sb3_dce.numpy_policy import NumpyPolicy
 from sb3_dce.processes import prepare_worker
@@ -156,12 +157,11 @@ def check_target(out: Path, name: str | None, env: str | None, force: bool) -> s
             key="name",
             hint="For example --name hopper-mine-sb3.",
         )
-    claimed = spec_of_file(out)
-    for spec in (claimed, _known(name)):
+    claimed, known = spec_of_file(out), known_dataset(name)
+    for spec in (claimed, known):
         if spec is not None and (spec.embedded or not spec.generated):
             owner = "the file that comes with the package" if spec.embedded else "an official D4RL dataset"
             raise ConfigError(f"{spec.id} is {owner}", where=str(out), key="out", hint="Choose another name, ending in -sb3.")
-    known = _known(name)
     if claimed is not None and claimed.id != name:
         raise ConfigError(
             f"the file name says {claimed.id}, the name is {name}", where=str(out), key="name", hint="Use one of both."
@@ -297,13 +297,6 @@ def _settings(spec: RecordingSpec, runner: EpisodeRunner) -> dict[str, Any]:
 def _env_id(env: str) -> str:
     spec = dataset_of_env(env)
     return env if spec is None or spec.env_id is None else spec.env_id
-
-
-def _known(name: str) -> DatasetSpec | None:
-    try:
-        return resolve(name)
-    except DatasetError:
-        return None
 
 
 def _chunks(runner: EpisodeRunner, first: int, workers: int) -> Generator[tuple[Arrays, list[int]], None, None]:
