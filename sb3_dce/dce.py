@@ -249,7 +249,7 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
         self._beta_schedule()
 
     def _beta_schedule(self) -> StepSchedule:
-        return StepSchedule(self.beta, self.beta_final, self.beta_rate, self.beta_update_every * self.steps_per_epoch)
+        return StepSchedule.of(vars(self))
 
     def policy_settings(self) -> dict[str, Any]:
         return {
@@ -356,8 +356,7 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
         return extra
 
     def check_dataset_fits(self, reward_mean: float, n_terminals: int) -> list[str]:
-        largest = self.beta if self.beta_final is None or self.beta_rate == 0 else max(self.beta, self.beta_final)
-        shift = beta_eff(largest, self.td_loss_coef)
+        shift = beta_eff(self._beta_schedule().largest, self.td_loss_coef)
         if n_terminals > 0 and shift > reward_mean:
             return [
                 f"beta / (2 * td_loss_coef) = {shift:.3g} is above the mean reward per step {reward_mean:.3g} of data with "

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from sb3_dce.errors import ConfigError
 
@@ -41,6 +43,23 @@ class StepSchedule:
                 hint="For a constant beta set beta_final=None and beta_rate=0, too: a dataset's row may schedule it. "
                 "beta falls by beta_rate at each change, a negative rate lets it rise.",
             )
+
+    @classmethod
+    def of(cls, settings: Mapping[str, Any]) -> StepSchedule:
+        """
+        :param settings: arguments of :class:`~sb3_dce.OfflineDCE`, or a complete row of its hyperparameters
+        :return: schedule of beta
+        :raises ConfigError: if they contradict each other
+        """
+        every = settings["beta_update_every"] * settings["steps_per_epoch"]
+        return cls(settings["beta"], settings["beta_final"], settings["beta_rate"], every)
+
+    @property
+    def largest(self) -> float:
+        """
+        :return: largest value it ever has
+        """
+        return self.initial if self.final is None or self.rate == 0 else max(self.initial, self.final)
 
     def value(self, n_updates: int) -> float:
         """

@@ -48,6 +48,18 @@ def shift_factor(n_updates: int, gamma: float, tau: float) -> float:
     return 1.0 + gamma * (1.0 - (1.0 - tau * (1.0 - gamma)) ** (n_updates - 1)) / (1.0 - gamma)
 
 
+def value_shift_factor(n_updates: int, gamma: float, tau: float) -> float:
+    """
+    :func:`shift_factor` for V: since ``q = gamma v - 1``, V falls by what Q falls beyond its own penalty, over gamma.
+
+    :param n_updates: gradient steps k, at least 1
+    :param gamma: discount factor in (0, 1)
+    :param tau: Polyak coefficient
+    :return: dimensionless factor, in units of beta_eff
+    """
+    return (shift_factor(n_updates, gamma, tau) - 1.0) / gamma
+
+
 def penalty_bound(beta: float, gamma: float, density_ratio: float = 1.0, n: float = math.inf) -> float:
     """
     Bound on the error the penalty introduces, ``ratio * (1 - gamma^(n+1)) / (1 - gamma) * beta`` (Eq. 14).

@@ -396,6 +396,14 @@ def test_beta_changes_only_after_fifty_whole_epochs() -> None:
     assert schedule.value(10**9) == 0.1
 
 
+@pytest.mark.parametrize(
+    ("schedule", "largest"),
+    [((4.0, 0.1, 3.9), 4.0), ((4.0, 18.0, -14.0), 18.0), ((4.0, None, 0.0), 4.0), ((4.0, 18.0, 0.0), 4.0)],
+)
+def test_largest_beta_is_one_the_schedule_reaches(schedule: tuple[float, float | None, float], largest: float) -> None:
+    assert StepSchedule(*schedule).largest == largest == max(StepSchedule(*schedule).value(n) for n in (0, 10**9))
+
+
 def test_agents_beta_is_a_function_of_its_updates(transitions: Transitions) -> None:
     model = OfflineDCE(
         "MlpPolicy", dataset=transitions, beta=4.0, beta_final=18.0, beta_rate=-14.0, policy_kwargs={"net_arch": [4]}

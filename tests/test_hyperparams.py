@@ -44,10 +44,6 @@ def _distinct_rows() -> list[tuple[str, str, dict[str, Any]]]:
 DISTINCT = _distinct_rows()
 
 
-def _schedule(row: dict[str, Any]) -> StepSchedule:
-    return StepSchedule(row["beta"], row["beta_final"], row["beta_rate"], row["beta_update_every"] * row["steps_per_epoch"])
-
-
 @all_rows
 def test_row_says_how_long_to_train_which_policy(algo: str, name: str, row: dict[str, Any]) -> None:
     arguments, n_timesteps, zoo = hyperparams.split_row(row)
@@ -115,13 +111,13 @@ def test_dce_row_has_the_papers_values(paper: dict[str, str]) -> None:
 
 @pytest.mark.parametrize("dataset", BETAS)
 def test_dce_row_reproduces_the_papers_beta_at_every_change(dataset: str) -> None:
-    schedule = _schedule(hyperparams.load_row("dce", dataset))
+    schedule = StepSchedule.of(hyperparams.load_row("dce", dataset))
     values = [schedule.value(epoch * 1000) for epoch in range(0, 1001, 50)]
     assert values == pytest.approx(BETAS[dataset], abs=1e-6)
 
 
 def test_beta_holds_for_the_whole_interval_of_50_epochs() -> None:
-    schedule = _schedule(hyperparams.load_row("dce", "hopper-medium-replay-v2"))
+    schedule = StepSchedule.of(hyperparams.load_row("dce", "hopper-medium-replay-v2"))
     assert schedule.value(49_999) == 4.0
     assert schedule.value(50_000) == pytest.approx(0.1)
 

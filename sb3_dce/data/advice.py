@@ -25,6 +25,7 @@ from sb3_dce.data.quality import HUGE_VALUE
 from sb3_dce.data.records import DatasetInfo
 from sb3_dce.data.transitions import Transitions
 from sb3_dce.errors import ConfigError, DatasetError, DatasetSemanticsError, DatasetWarning
+from sb3_dce.schedules import StepSchedule
 
 Verdict = Literal["ok", "note", "warning", "error"]
 VERDICTS: tuple[Verdict, ...] = ("ok", "note", "warning", "error")
@@ -158,8 +159,7 @@ def row_penalty(spec: DatasetSpec | None, beta: float | None = None) -> Penalty:
         if not 0 <= beta < float("inf"):
             raise ConfigError(f"must be a number of at least 0, got {beta}", where="beta", key="beta", hint="For example 2.0.")
         return Penalty(float(beta), coefficient, "the given beta")
-    ends = [row["beta"]] if row["beta_final"] is None else [row["beta"], row["beta_final"]]
-    return Penalty(float(max(ends)), coefficient, f"the row of {spec.id}" if spec else "the default row")
+    return Penalty(float(StepSchedule.of(row).largest), coefficient, f"the row of {spec.id}" if spec else "the default row")
 
 
 def examine(name_or_path: str | PathLike[str], *, beta: float | None = None, **options: Any) -> Examination:

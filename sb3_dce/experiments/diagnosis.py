@@ -118,8 +118,9 @@ def _is_same(evidence: Evidence, one: Variant, other: Variant, dataset_id: str) 
     settings = [settings_in_force(v, dataset_id, evidence.scale) for v in (one, other)]
     schedules = []
     for each in settings:
-        every = each.pop("beta_update_every") * each.pop("steps_per_epoch")
-        schedules.append(StepSchedule(each.pop("beta"), each.pop("beta_final"), each.pop("beta_rate"), every))
+        schedules.append(StepSchedule.of(each))
+        for name in ("beta", "beta_final", "beta_rate", "beta_update_every", "steps_per_epoch"):
+            del each[name]
     n_updates = evidence.n_updates(dataset_id) or 1
     return settings[0] == settings[1] and schedules[0].changes(n_updates) == schedules[1].changes(n_updates)
 

@@ -15,9 +15,17 @@ import numpy as np
 import pandas as pd
 
 from sb3_dce.data.catalog import resolve
-from sb3_dce.experiments.configuration import row_of
-from sb3_dce.experiments.grid import EMBEDDED, Experiment, GridDataset, Scale, Variant, source_of, variant_hash
-from sb3_dce.theory import beta_eff, shift_factor
+from sb3_dce.experiments.grid import (
+    EMBEDDED,
+    Experiment,
+    GridDataset,
+    Scale,
+    Variant,
+    settings_in_force,
+    source_of,
+    variant_hash,
+)
+from sb3_dce.theory import beta_eff, shift_factor, value_shift_factor
 
 UPDATES_PER_EPOCH = 1000
 GAMMA, TAU = 0.99, 0.005  # of all DCE runs of the figures (paper, common configuration)
@@ -281,8 +289,8 @@ class Evidence:
         steps = np.asarray(lowered.index, dtype=int)
         width = int(steps[0]) if len(steps) else 0
         # logged values are means over the interval before the step
-        factors = np.array([shift_factor(max(1, int(step - width / 2)), GAMMA, TAU) for step in steps])
-        expected = unit * factors if of == "q_data" else unit * (factors - 1.0) / GAMMA
+        factor = shift_factor if of == "q_data" else value_shift_factor
+        expected = [unit * factor(max(1, int(step - width / 2)), GAMMA, TAU) for step in steps]
         return lowered, pd.Series(expected, index=lowered.index, dtype=float)
 
     def beta_eff(self, variant: Variant, dataset_id: str) -> float:
@@ -291,7 +299,7 @@ class Evidence:
         :param dataset_id: data
         :return: shift per Bellman step, reward units
         """
-        settings = {"td_loss_coef": 1.0, "beta": 4.0, **row_of(variant.algo, dataset_id), **variant.set}
+        settings = settings_in_force(variant, dataset_id, self.scale)
         return beta_eff(settings["beta"], settings["td_loss_coef"])
 
     # -- captions --------------------------------------------------------------------------------------------------

@@ -191,8 +191,7 @@ def config_table() -> TextTable:
         name = printed["dataset"]
         ours = row_of("dce", name)
         beta, final, rate = ours["beta"], ours["beta_final"], ours["beta_rate"]
-        every = ours["beta_update_every"] * ours["steps_per_epoch"]
-        schedule = StepSchedule(beta, final, rate, every)
+        schedule = StepSchedule.of(ours)
         same = all(
             abs(schedule.value(int(epoch) * ours["steps_per_epoch"]) - float(value)) < 1e-6
             for epoch, value in schedules[name].items()

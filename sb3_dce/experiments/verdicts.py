@@ -14,7 +14,7 @@ import numpy as np
 
 from sb3_dce.dce_probe import PROBE_BETAS
 from sb3_dce.experiments.configuration import row_of
-from sb3_dce.experiments.evidence import Evidence
+from sb3_dce.experiments.evidence import GAMMA, Evidence
 from sb3_dce.experiments.figures import probe_difference
 from sb3_dce.experiments.grid import source_of
 from sb3_dce.experiments.judging import (
@@ -39,6 +39,7 @@ from sb3_dce.experiments.judging import (
 )
 from sb3_dce.experiments.statistics import bootstrap_interval, sample_std
 from sb3_dce.experiments.tables import fastest_run
+from sb3_dce.theory import penalty_bound
 
 
 def verdicts(evidence: Evidence) -> list[Verdict]:
@@ -147,7 +148,7 @@ def _bounds(evidence: Evidence) -> list[Verdict]:
         variant = experiment.variant(name)
         lowered, _ = evidence.shift(variant, experiment.variant("beta 0"), dataset_id)
         if not lowered.empty:
-            shares[name] = float(lowered.mean(axis=1).max() / (100.0 * evidence.beta_eff(variant, dataset_id)))
+            shares[name] = float(lowered.mean(axis=1).max() / penalty_bound(evidence.beta_eff(variant, dataset_id), GAMMA))
     bound = judge(
         "The penalty lowers Q by at most the bound of Eq. 14",
         "largest measured shift, with the density ratio 1 and n infinite, divided by beta_eff / (1 - gamma), is at most 1.05",
