@@ -38,11 +38,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_dce import OfflineDCE
 from sb3_dce.data.hashes import file_sha256
 from sb3_dce.envs import make_env_if_possible, without_bookkeeping
-from sb3_dce.evaluation import evaluation_seed, make_rollouts
+from sb3_dce.evaluation import evaluation_seed
 from sb3_dce.evaluation_pool import EvaluationPool
 from sb3_dce.numpy_policy import MLPPolicy
 from sb3_dce.recording.policy_files import load_policy
-from sb3_dce.rollouts import Act, Rollouts, deterministic_act
+from sb3_dce.rollouts import Act, Rollouts, deterministic_act, make_rollouts
 
 DATASETS = {"HalfCheetah-v4": "halfcheetah-medium-v2", "Hopper-v4": "hopper-medium-v2", "Walker2d-v4": "walker2d-medium-v2"}
 N_SIDE_BY_SIDE, N_IN_TURN = 10, 2

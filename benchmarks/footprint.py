@@ -109,8 +109,8 @@ def worker(folder: Path) -> Measured:
     """A worker process of an evaluation, after ten episodes of HalfCheetah side by side."""
     from sb3_dce import OfflineDCE
     from sb3_dce.envs import make_env_if_possible
-    from sb3_dce.evaluation import make_rollouts
     from sb3_dce.evaluation_pool import EvaluationPool
+    from sb3_dce.rollouts import make_rollouts
 
     dataset_id = "halfcheetah-medium-v2"
     rollouts = make_rollouts(dataset_id, 10)

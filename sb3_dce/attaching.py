@@ -21,7 +21,6 @@ from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_dce import hyperparams
 from sb3_dce.buffers import OfflineReplayBuffer
-from sb3_dce.checks import is_untouched, vec_normalize_of
 from sb3_dce.data import Transitions, find_file, load_dataset, load_transitions
 from sb3_dce.data.catalog import DatasetSpec, resolve
 from sb3_dce.data.locate import is_path
@@ -29,6 +28,7 @@ from sb3_dce.data.minari import is_minari_name
 from sb3_dce.envs import SpacesEnv, dataset_spaces, make_env_if_possible, make_minari_env
 from sb3_dce.errors import ConfigError, DatasetIntegrityError, DatasetSemanticsError, DatasetWarning
 from sb3_dce.networks import StandardizedExtractor
+from sb3_dce.normalizing import FEWEST_OBSERVATIONS, is_untouched, vec_normalize_of
 
 DatasetLike = str | os.PathLike[str] | Transitions
 SelfAttaching = TypeVar("SelfAttaching", bound="AttachingMixin")
@@ -330,10 +330,6 @@ class AttachingMixin(OffPolicyAlgorithm):
         for module in self.policy.modules():
             if isinstance(module, StandardizedExtractor):
                 module.set_statistics(mean, std)
-
-
-# Running statistics of fewer observations say nothing of a task: a reset or an episode of an untrained policy.
-FEWEST_OBSERVATIONS = 2000
 
 
 def as_dataset(source: Any) -> DatasetLike:

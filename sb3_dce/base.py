@@ -25,17 +25,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dce.attaching import AttachingMixin, DatasetLike
 from sb3_dce.buffers import OfflineReplayBuffer
-from sb3_dce.checks import (
-    callback_frequencies,
-    check_choice,
-    check_device,
-    check_flags,
-    check_number,
-    check_policy_kwargs,
-    check_seed,
-    check_spaces,
-    check_steps,
-)
+from sb3_dce.checks import check_choice, check_number, check_seed, check_steps
 from sb3_dce.envs import SpacesEnv
 from sb3_dce.errors import ConfigError, SB3DCEWarning
 from sb3_dce.execution import EXECUTIONS, Engine, Update, choose_execution, refuse_divergence
@@ -45,6 +35,7 @@ from sb3_dce.noise import NoiseSpec
 from sb3_dce.precision import PRECISIONS, matmul_precision
 from sb3_dce.processes import UninterruptedBlock
 from sb3_dce.saving import SavingMixin
+from sb3_dce.sb3_checks import callback_frequencies, check_device, check_flags, check_policy_kwargs, check_spaces
 from sb3_dce.state import Storage, TrainState
 
 SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")

@@ -13,6 +13,7 @@ import yaml
 from rich.console import Console
 
 from sb3_dce import cli_datasets
+from sb3_dce.checks import LAST_SEED
 from sb3_dce.cli_datasets import DatasetArgument
 from sb3_dce.errors import ConfigError, SB3DCEError
 
@@ -27,7 +28,6 @@ app.add_typer(cli_datasets.app, name="datasets")
 
 console = Console(highlight=False)
 
-LAST_SEED = 2**32 - 1  # of NumPy's generators
 # Arguments of the agents that these commands set themselves.
 NOT_FOR_SET = {
     "dataset": "The dataset is named before: train DATASET, compare --dataset DATASET.",

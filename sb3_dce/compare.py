@@ -22,7 +22,7 @@ from sb3_dce.data.catalog import DatasetSpec, normalized_score
 from sb3_dce.data.locate import short_name
 from sb3_dce.errors import ConfigError, DivergenceError
 from sb3_dce.evaluation import read_evaluations
-from sb3_dce.files import write_atomically
+from sb3_dce.files import write_text
 from sb3_dce.hyperparams import check_keys, full_name
 from sb3_dce.launch import launch_all
 from sb3_dce.plots import plot_learning_curves
@@ -251,8 +251,7 @@ def _write_markdown(path: Path, title: str, lines: list[list[str]], notes: list[
     text += [" ".join(["Last evaluation of each run; the seconds are wall time, evaluations included.", *notes]), ""]
     if picture is not None:
         text += [f"![Learning curves]({picture.name})", "", BANDS, ""]
-    with write_atomically(path) as stream:
-        stream.write("\n".join(text).encode())
+    write_text(path, "\n".join(text))
 
 
 def _write_csv(path: Path, results: dict[str, list[dict[str, Any]]]) -> None:
@@ -264,5 +263,4 @@ def _write_csv(path: Path, results: dict[str, list[dict[str, Any]]]) -> None:
             rate = round(1000 * r["seconds"] / r["n_updates"], 3)
             values = (r["n_updates"], r["mean_return"], r["normalized_score"], r["seconds"], rate)
             writer.writerow([algo, r["config"]["seed"], *values, json.dumps(r["config"].get("overrides", {}))])
-    with write_atomically(path) as stream:
-        stream.write(text.getvalue().encode())
+    write_text(path, text.getvalue())

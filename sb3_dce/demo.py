@@ -17,12 +17,12 @@ from sb3_dce.data import load_transitions
 from sb3_dce.data.catalog import normalized_score, resolve
 from sb3_dce.envs import dataset_spaces
 from sb3_dce.errors import ConfigError
-from sb3_dce.evaluation import make_rollouts, read_evaluations
+from sb3_dce.evaluation import read_evaluations
 from sb3_dce.execution import choose_execution
-from sb3_dce.files import write_atomically
+from sb3_dce.files import write_text
 from sb3_dce.launch import launch
 from sb3_dce.plots import plot_learning_curves
-from sb3_dce.rollouts import Rollouts
+from sb3_dce.rollouts import Rollouts, make_rollouts
 from sb3_dce.runs import RunSpec, alone
 
 DATASET = "halfcheetah-demo-sb3"
@@ -143,5 +143,4 @@ def _write_results(folder: Path, table: dict[str, list[float]]) -> None:
         name: {"returns": values, "normalized_score": float(normalized_score(DATASET, np.mean(values)))}
         for name, values in table.items()
     }
-    with write_atomically(folder / "results.json") as stream:
-        stream.write(json.dumps(rows, indent=1).encode())
+    write_text(folder / "results.json", json.dumps(rows, indent=1))

@@ -11,18 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_dce.checks import check_number
-from sb3_dce.data.catalog import normalized_score, resolve
-from sb3_dce.data.locate import known_dataset
-from sb3_dce.data.minari import is_minari_name
-from sb3_dce.envs import make_env_if_possible, make_minari_env, missing_simulator
+from sb3_dce.checks import LAST_SEED, check_number
+from sb3_dce.data.catalog import normalized_score
 from sb3_dce.errors import CheckpointError
 from sb3_dce.evaluation_pool import EvaluationPool
-from sb3_dce.files import check_writable, write_atomically
+from sb3_dce.files import check_writable, write_atomically, write_text
 from sb3_dce.rollouts import Rollouts, deterministic_act
 
 # Seeds of two evaluations must not overlap; no evaluation has more episodes than this.
@@ -67,48 +63,6 @@ class Evaluation:
         return None if self.dataset_id is None else float(normalized_score(self.dataset_id, self.mean))
 
 
-def catalogue_id(dataset: str | None) -> str | None:
-    """
-    :param dataset: id or file name
-    :return: id of the catalogue, ``None`` if it is not in there
-    """
-    spec = None if dataset is None else known_dataset(dataset)
-    return None if spec is None else spec.id
-
-
-def make_rollouts(dataset_id: str, n_episodes: int, n_envs: int | None = None) -> Rollouts | None:
-    """
-    :param dataset_id: id of the catalogue
-    :param n_episodes: episodes of an evaluation
-    :param n_envs: environments that play them, see :class:`~sb3_dce.rollouts.Rollouts`
-    :return: environments to evaluate in, or ``None`` where there is no simulator
-    """
-    if missing_simulator(resolve(dataset_id)) is not None:
-        return None
-    return Rollouts(lambda: make_env_if_possible(dataset_id), n_episodes, n_envs, dataset_id)
-
-
-def rollouts_of(dataset: str | None, n_episodes: int, n_envs: int | None = None) -> Rollouts | None:
-    """
-    :param dataset: id, file or ``minari:`` name a model was trained on
-    :param n_episodes: episodes of an evaluation
-    :param n_envs: environments that play them, see :class:`~sb3_dce.rollouts.Rollouts`
-    :return: environments to evaluate in, or ``None`` where none is known or there is no simulator
-    """
-    dataset_id = catalogue_id(dataset)
-    if dataset_id is not None:
-        return make_rollouts(dataset_id, n_episodes, n_envs)
-    if not is_minari_name(dataset) or make_minari_env(dataset) is None:
-        return None
-
-    def make_env() -> gym.Env:
-        env = make_minari_env(dataset)
-        assert env is not None
-        return env
-
-    return Rollouts(make_env, n_episodes, n_envs, dataset)
-
-
 def evaluate(model: Any, rollouts: Rollouts, seed: int, dataset_id: str | None = None) -> Evaluation:
     """
     Deterministic episodes with fixed seeds: the returns of ``evaluate_policy`` on a ``DummyVecEnv`` with as many environments
@@ -131,7 +85,7 @@ def evaluation_seed(run_seed: int, index: int) -> int:
     :return: seed of its first episode; no other evaluation of any run has it
     """
     block, index = divmod(index, 1000)  # runs that are evaluated more often go on beyond the blocks of all run seeds
-    return SEEDS_PER_EVALUATION * (index + 1000 * (run_seed + 2**32 * block))
+    return SEEDS_PER_EVALUATION * (index + 1000 * (run_seed + (LAST_SEED + 1) * block))
 
 
 class EvaluationCallback(BaseCallback):
@@ -230,8 +184,7 @@ def write_evaluations(folder: Path, evaluations: list[Evaluation]) -> None:
         score = "" if e.score is None else round(e.score, 4)
         length = round(float(np.mean(e.lengths)), 2)
         writer.writerow([e.n_updates, len(e.returns), round(e.mean, 4), round(e.std, 4), score, length])
-    with write_atomically(folder / "evaluations.csv") as stream:
-        stream.write(text.getvalue().encode())
+    write_text(folder / "evaluations.csv", text.getvalue())
 
 
 def read_evaluations(folder: Path, dataset_id: str | None) -> list[Evaluation]:

@@ -24,7 +24,17 @@ from sb3_dce.checks import check_number
 from sb3_dce.errors import ConfigError, SB3DCEError
 from sb3_dce.mlp_actor import ActorSnapshot, MLPActor, actor_snapshot
 from sb3_dce.processes import prepare_worker
-from sb3_dce.rollouts import Act, Ending, Episodes, Rollouts, deterministic_act, in_order, plain_policy, policy_act
+from sb3_dce.rollouts import (
+    Act,
+    Ending,
+    Episodes,
+    Rollouts,
+    deterministic_act,
+    in_order,
+    plain_policy,
+    policy_act,
+    rollouts_of,
+)
 
 # What a worker needs to act: arrays, or the class of a policy and the file that its `save` makes.
 Payload = ActorSnapshot | tuple[type[BasePolicy], bytes]
@@ -95,7 +105,7 @@ class EvaluationPool:
         A model with a ``predict`` of its own, or a policy that cannot be sent, is evaluated here before this returns.
 
         :param model: agent
-        :param rollouts: environments, from :func:`~sb3_dce.evaluation.rollouts_of`
+        :param rollouts: environments, from :func:`~sb3_dce.rollouts.rollouts_of`
         :param seed: of the first environment
         :param parts: workers that share the episodes
         :return: the episodes
@@ -110,7 +120,7 @@ class EvaluationPool:
             raise ConfigError(
                 "only environments that are known by a dataset's name can be made in worker processes",
                 key="n_workers",
-                hint="Use n_workers=0, or environments from sb3_dce.evaluation.rollouts_of.",
+                hint="Use n_workers=0, or environments from sb3_dce.rollouts.rollouts_of.",
             )
         recipe = (rollouts.dataset, rollouts.n_episodes, rollouts.n_envs)
         parts = max(1, min(parts, self.n_workers, rollouts.n_envs))
@@ -173,8 +183,6 @@ def _prepare() -> None:
 
 
 def _play(payload: Payload, recipe: tuple[str, int, int], seed: int, rows: range) -> list[Ending]:
-    from sb3_dce.evaluation import rollouts_of  # it imports this module
-
     if recipe not in _rollouts:
         made = rollouts_of(*recipe)
         assert made is not None

@@ -36,12 +36,24 @@ def write_atomically(target: pathlib.Path) -> Iterator[BinaryIO]:
         os.chmod(temporary, 0o666 & ~_umask())  # mkstemp makes private files
         os.replace(temporary, target)
         temporary = None
-        _sync_folder(target.parent)
+        sync_folder(target.parent)
     except OSError as error:
         raise cannot_write(target, error) from error
     finally:
         if temporary is not None and os.path.exists(temporary):
             os.unlink(temporary)
+
+
+def write_text(target: pathlib.Path, text: str) -> None:
+    """
+    Write a text in UTF-8 by :func:`write_atomically`.
+
+    :param target: file to write; missing folders are created
+    :param text: its content
+    :raises CheckpointError: if it cannot be written; a file that was there is untouched
+    """
+    with write_atomically(target) as stream:
+        stream.write(text.encode())
 
 
 # Younger files may be those of a process on another machine.
@@ -73,8 +85,12 @@ def process_lives(pid: int) -> bool:
     return True
 
 
-def _sync_folder(folder: pathlib.Path) -> None:
-    """So that the new name survives a power cut, too; not every system can."""
+def sync_folder(folder: pathlib.Path) -> None:
+    """
+    Make a new name in a folder survive a power cut, too; not every system can.
+
+    :param folder: existing folder
+    """
     with contextlib.suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:

@@ -24,20 +24,14 @@ from stable_baselines3.common.utils import get_device
 
 from sb3_dce.agents import agent_class
 from sb3_dce.base import OfflineAlgorithm
+from sb3_dce.data.locate import catalogue_id
 from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError
-from sb3_dce.evaluation import (
-    Evaluation,
-    catalogue_id,
-    evaluation_seed,
-    read_evaluations,
-    rollouts_of,
-    write_evaluations,
-)
+from sb3_dce.evaluation import Evaluation, evaluation_seed, read_evaluations, write_evaluations
 from sb3_dce.evaluation_pool import EvaluationPool, PendingEpisodes
 from sb3_dce.files import write_atomically
 from sb3_dce.launch import launch, progress_display, show_evaluation
 from sb3_dce.population import Population
-from sb3_dce.rollouts import Rollouts
+from sb3_dce.rollouts import Rollouts, rollouts_of
 from sb3_dce.runs import RunSpec, alone, read_result, refuse_other_run, write_config, write_divergence, write_result
 
 # Beside the members' folders: how far all have come, and the state of the common random generator.

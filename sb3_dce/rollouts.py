@@ -17,10 +17,14 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_dce.checks import check_number, vec_normalize_of
-from sb3_dce.envs import without_bookkeeping
+from sb3_dce.checks import check_number
+from sb3_dce.data.catalog import resolve
+from sb3_dce.data.locate import catalogue_id
+from sb3_dce.data.minari import is_minari_name
+from sb3_dce.envs import make_env_if_possible, make_minari_env, missing_simulator, without_bookkeeping
 from sb3_dce.locomotion import EnvSteps, fast_steps
 from sb3_dce.mlp_actor import MLPActor, actor_snapshot
+from sb3_dce.normalizing import vec_normalize_of
 
 Act = Callable[[np.ndarray], np.ndarray]
 
@@ -75,7 +79,7 @@ class Rollouts:
     :param make_env: makes one environment
     :param n_episodes: episodes of an evaluation
     :param n_envs: environments; default: as many as episodes
-    :param dataset: id or name from which :func:`~sb3_dce.evaluation.rollouts_of` makes the same in another process
+    :param dataset: id or name from which :func:`~sb3_dce.rollouts.rollouts_of` makes the same in another process
     :raises ConfigError: if a number is below 1
     """
 
@@ -158,6 +162,39 @@ class Rollouts:
         for env in self._envs.values():
             env.close()
         self._envs, self._steps = {}, None
+
+
+def make_rollouts(dataset_id: str, n_episodes: int, n_envs: int | None = None) -> Rollouts | None:
+    """
+    :param dataset_id: id of the catalogue
+    :param n_episodes: episodes of an evaluation
+    :param n_envs: environments that play them, see :class:`~sb3_dce.rollouts.Rollouts`
+    :return: environments to evaluate in, or ``None`` where there is no simulator
+    """
+    if missing_simulator(resolve(dataset_id)) is not None:
+        return None
+    return Rollouts(lambda: make_env_if_possible(dataset_id), n_episodes, n_envs, dataset_id)
+
+
+def rollouts_of(dataset: str | None, n_episodes: int, n_envs: int | None = None) -> Rollouts | None:
+    """
+    :param dataset: id, file or ``minari:`` name a model was trained on
+    :param n_episodes: episodes of an evaluation
+    :param n_envs: environments that play them, see :class:`~sb3_dce.rollouts.Rollouts`
+    :return: environments to evaluate in, or ``None`` where none is known or there is no simulator
+    """
+    dataset_id = catalogue_id(dataset)
+    if dataset_id is not None:
+        return make_rollouts(dataset_id, n_episodes, n_envs)
+    if not is_minari_name(dataset) or make_minari_env(dataset) is None:
+        return None
+
+    def make_env() -> gym.Env:
+        env = make_minari_env(dataset)
+        assert env is not None
+        return env
+
+    return Rollouts(make_env, n_episodes, n_envs, dataset)
 
 
 def plain_policy(model: Any) -> BasePolicy | None:

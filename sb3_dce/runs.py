@@ -27,10 +27,12 @@ from sb3_dce.agents import agent_class
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.data import find_file
 from sb3_dce.data.hashes import sha256_once
+from sb3_dce.data.locate import catalogue_id
 from sb3_dce.data.locking import held
 from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError
-from sb3_dce.evaluation import Evaluation, EvaluationCallback, catalogue_id, rollouts_of, write_evaluations
-from sb3_dce.files import cannot_write, write_atomically
+from sb3_dce.evaluation import Evaluation, EvaluationCallback, write_evaluations
+from sb3_dce.files import cannot_write, write_text
+from sb3_dce.rollouts import rollouts_of
 
 OTHER_FOLDER = "Choose another folder with --out, or delete this one."
 BEGIN_ANEW = "Delete the run's folder to run it anew, or choose another one with --out."
@@ -210,7 +212,7 @@ def write_result(spec: RunSpec, folder: Path, evaluations: list[Evaluation], sec
         "normalized_score": None if last is None else last.score,
         "evaluated_at": None if last is None else last.n_updates,
     }
-    _write_text(folder / "result.json", json.dumps(result, indent=1))
+    write_text(folder / "result.json", json.dumps(result, indent=1))
     return result
 
 
@@ -232,7 +234,7 @@ def write_divergence(folder: Path, n_updates: int, reason: str) -> None:
     :param n_updates: gradient steps before which it happened
     :param reason: in words
     """
-    _write_text(folder / "diverged.json", json.dumps({"n_updates": n_updates, "reason": reason}))
+    write_text(folder / "diverged.json", json.dumps({"n_updates": n_updates, "reason": reason}))
 
 
 def read_divergence(folder: Path) -> dict[str, Any] | None:
@@ -403,7 +405,7 @@ def write_config(spec: RunSpec, model: OfflineAlgorithm, folder: Path, device: s
         },
         "machine": {"processor": platform.machine(), "device": device or str(model.device), "threads": th.get_num_threads()},
     }
-    _write_text(folder / "config.yml", yaml.safe_dump(config, sort_keys=False))
+    write_text(folder / "config.yml", yaml.safe_dump(config, sort_keys=False))
 
 
 def _plain(value: Any) -> Any:
@@ -414,8 +416,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.generic):
         return value.item()
     return value if value is None or isinstance(value, bool | int | float | str) else repr(value)
-
-
-def _write_text(path: Path, text: str) -> None:
-    with write_atomically(path) as stream:
-        stream.write(text.encode())

@@ -18,9 +18,10 @@ from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 
 from sb3_dce import hyperparams
-from sb3_dce.checks import check_device, check_seed
+from sb3_dce.checks import check_seed
 from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError, SB3DCEError
 from sb3_dce.files import write_atomically
+from sb3_dce.sb3_checks import check_device
 
 DAMAGED = "The file is damaged or something else: give a zip file written by model.save()."
 

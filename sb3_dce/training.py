@@ -17,12 +17,13 @@ from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.checks import check_ends_with_evaluation
 from sb3_dce.data import find_file
 from sb3_dce.data.catalog import resolve
-from sb3_dce.data.locate import short_name
+from sb3_dce.data.locate import catalogue_id, short_name
 from sb3_dce.envs import missing_simulator
 from sb3_dce.errors import CheckpointError, ConfigError
-from sb3_dce.evaluation import Evaluation, catalogue_id, evaluate, read_evaluations, rollouts_of
+from sb3_dce.evaluation import Evaluation, evaluate, read_evaluations
 from sb3_dce.launch import launch
 from sb3_dce.plots import plot_learning_curves
+from sb3_dce.rollouts import rollouts_of
 from sb3_dce.runs import RunSpec
 from sb3_dce.saving import existing_zip, saved_algo
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_dce.data import D4RLFile, file_sha256, normalized_score
-from sb3_dce.files import write_atomically
+from sb3_dce.files import write_text
 from sb3_dce.recording.generate import Sources, generate
 
 GYM = tuple(
@@ -50,8 +50,7 @@ def make(dataset_id: str, policies: Path, folder: Path, adroit_rows: int) -> Non
         "cpu_seconds": time.process_time() - cpu_started,
         "steps": made.new_rows,
     }
-    with write_atomically(folder / "times.json") as stream:
-        stream.write(json.dumps(times, indent=1).encode())
+    write_text(folder / "times.json", json.dumps(times, indent=1))
 
 
 def read_times(folder: Path) -> dict[str, dict[str, float]]:

@@ -17,7 +17,8 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from sb3_dce.evaluation import Evaluation, catalogue_id
+from sb3_dce.data.locate import catalogue_id
+from sb3_dce.evaluation import Evaluation
 from sb3_dce.plots import plot_learning_curves
 
 N_RESAMPLES = 10_000

@@ -13,7 +13,8 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from sb3_dce.evaluation import catalogue_id, read_evaluations
+from sb3_dce.data.locate import catalogue_id
+from sb3_dce.evaluation import read_evaluations
 
 # Diagnostics shown, a mean over the last log rows of a run.
 DIAGNOSTICS = ("q_data", "q_policy", "gap_td", "beta_eff", "beta_pred_shift", "ent_coef", "entropy", "action_dist")

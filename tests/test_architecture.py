@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -19,9 +20,12 @@ ALGORITHMS += ("uwac.py",)
 
 
 def imported(path: Path) -> set[str]:
-    """Full names of all modules a file imports, at its top or inside a function."""
+    """Full names of all modules a file imports, at its top or inside a function, for more than its annotations."""
     names: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            node.body = []
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -54,6 +58,13 @@ def test_only_its_own_module_imports_a_special_package(path: Path) -> None:
         assert not beginning_with(path, "sb3_dce.zoo")
     if relative not in ("plots.py", "report/figures.py", "experiments/figures.py"):
         assert "matplotlib" not in roots(path)
+
+
+def test_no_module_imports_itself_through_others() -> None:
+    """Imports inside functions included, since these only hide a circle; those for type checkers are none."""
+    modules = {".".join(("sb3_dce", *path.relative_to(PACKAGE).with_suffix("").parts)): path for path in FILES}
+    imports = {name: imported(path) & (modules.keys() - {name}) for name, path in modules.items()}
+    TopologicalSorter(imports).prepare()  # CycleError names the circle
 
 
 @pytest.mark.parametrize("path", sorted((PACKAGE / "data").glob("*.py")), ids=lambda path: path.name)

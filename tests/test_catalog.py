@@ -10,9 +10,8 @@ import pytest
 
 from sb3_dce.data import all_specs, available, find_file, normalized_score, resolve, spec_of_file
 from sb3_dce.data.catalog import D4RL_URL
-from sb3_dce.data.locate import cache_folder, is_path, known_dataset
+from sb3_dce.data.locate import cache_folder, catalogue_id, is_path, known_dataset
 from sb3_dce.errors import DatasetError, DatasetNotFoundError
-from sb3_dce.evaluation import catalogue_id
 from sb3_dce.hyperparams import load_row
 
 

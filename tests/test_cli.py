@@ -21,7 +21,8 @@ from typer.testing import CliRunner
 from sb3_dce import OfflineDCE, cli
 from sb3_dce.data import find_file, load_transitions
 from sb3_dce.errors import ConfigError
-from sb3_dce.evaluation import evaluate, evaluation_seed, rollouts_of
+from sb3_dce.evaluation import evaluate, evaluation_seed
+from sb3_dce.rollouts import rollouts_of
 
 TINY = "halfcheetah-tiny-sb3"
 FAST = ("--set", "policy_kwargs={net_arch: [16, 16]}", "--set", "execution=eager", "--set", "batch_size=32")

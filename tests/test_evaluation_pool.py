@@ -24,10 +24,10 @@ from update_tools import all_tensors, largest_difference
 from sb3_dce import OfflineDCE, OfflineUWAC
 from sb3_dce.envs import make_env_if_possible
 from sb3_dce.errors import ConfigError, DatasetError
-from sb3_dce.evaluation import EvaluationCallback, make_rollouts
+from sb3_dce.evaluation import EvaluationCallback
 from sb3_dce.evaluation_pool import EvaluationFailedError, EvaluationPool
 from sb3_dce.population_runs import STATE_FILE, BatchedRuns
-from sb3_dce.rollouts import Rollouts, deterministic_act
+from sb3_dce.rollouts import Rollouts, deterministic_act, make_rollouts
 
 HOPPER, N = "hopper-medium-v2", 3
 SMALL = {"net_arch": [16, 16]}
@@ -180,7 +180,7 @@ def test_no_process_is_left_behind(tmp_path: Path, how: str) -> None:
         "import multiprocessing as mp, time\n"
         "from sb3_dce import OfflineBC\n"
         "from sb3_dce.envs import make_env_if_possible\n"
-        "from sb3_dce.evaluation import make_rollouts\n"
+        "from sb3_dce.rollouts import make_rollouts\n"
         "from sb3_dce.evaluation_pool import EvaluationPool\n"
         "if __name__ == '__main__':\n"
         f"    model = OfflineBC('MlpPolicy', make_env_if_possible('{HOPPER}'), seed=0)\n"

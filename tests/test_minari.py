@@ -20,6 +20,7 @@ from minari_files import Hub, Steps, box, episode, record, write_dataset
 
 from sb3_dce import OfflineDCE, cli
 from sb3_dce.data import Transitions, find_file, load_transitions, normalized_score
+from sb3_dce.data.locate import catalogue_id
 from sb3_dce.data.minari_download import download_minari
 from sb3_dce.envs import SpacesEnv, make_minari_env
 from sb3_dce.errors import (
@@ -31,7 +32,6 @@ from sb3_dce.errors import (
     DatasetSecurityError,
     DownloadError,
 )
-from sb3_dce.evaluation import catalogue_id
 
 TINY = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 16, "device": "cpu"}
 

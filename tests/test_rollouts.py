@@ -19,10 +19,10 @@ from torch import nn
 from sb3_dce import OfflineBC, OfflineDCE, OfflineIQL, OfflineTD3BC, locomotion
 from sb3_dce.envs import SpacesEnv, make_dataset_env, make_env_if_possible
 from sb3_dce.errors import ConfigError
-from sb3_dce.evaluation import evaluate, make_rollouts
+from sb3_dce.evaluation import evaluate
 from sb3_dce.locomotion import EnvSteps, LocomotionSteps, _episode, fast_steps
 from sb3_dce.mlp_actor import MLPActor
-from sb3_dce.rollouts import Rollouts, deterministic_act, in_order
+from sb3_dce.rollouts import Rollouts, deterministic_act, in_order, make_rollouts
 
 N = 4
 

@@ -20,7 +20,7 @@ from sb3_dce.data.hashes import content_hash
 from sb3_dce.data.layout import CORE_KEYS
 from sb3_dce.data.transitions import Transitions
 from sb3_dce.errors import DatasetFormatError, DatasetNotFoundError, DatasetSemanticsError
-from sb3_dce.files import write_atomically
+from sb3_dce.files import write_text
 
 IDENTICAL, ALIKE, DIFFERENT = "identical", "statistically equal", "different"
 # Probability that some quantity of two samples of the same thing is called different: that of three standard errors.
@@ -100,8 +100,7 @@ class DatasetCard:
         :param path: file to write, JSON
         :raises CheckpointError: if it cannot be written
         """
-        with write_atomically(Path(path)) as stream:
-            stream.write((json.dumps(asdict(self), indent=1) + "\n").encode())
+        write_text(Path(path), json.dumps(asdict(self), indent=1) + "\n")
 
 
 @dataclass(frozen=True)

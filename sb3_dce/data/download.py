@@ -35,7 +35,7 @@ from sb3_dce.data.locate import DATASETS_VARIABLE, search, search_folders
 from sb3_dce.data.locking import exclusive
 from sb3_dce.data.network import Failed, Patience, make_opener, network_errors
 from sb3_dce.errors import CheckpointError, DatasetError, DatasetIntegrityError, DownloadError
-from sb3_dce.files import write_atomically
+from sb3_dce.files import sync_folder, write_text
 
 _LOG = logging.getLogger(__name__)
 MIRRORS_VARIABLE = "SB3_DCE_MIRRORS"
@@ -219,8 +219,7 @@ class _Download:
         """Remove the old bytes before the sidecar describes new ones, so that they can never be taken for each other."""
         with _local_errors(self._target):
             self._part.unlink(missing_ok=True)
-            with write_atomically(self._sidecar) as stream:
-                stream.write(json.dumps(asdict(version)).encode())
+            write_text(self._sidecar, json.dumps(asdict(version)))
 
     def _fill(self, part: BinaryIO, response: HTTPResponse, size: int | None) -> str:
         """Append the body to the bytes that are there; return the hash of all of them."""
@@ -272,12 +271,7 @@ class _Download:
         with open(self._part, "rb+") as part:
             os.fsync(part.fileno())
         os.replace(self._part, self._target)
-        if os.name != "nt":  # Windows cannot open a folder
-            descriptor = os.open(self._target.parent, os.O_RDONLY)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+        sync_folder(self._target.parent)
         write_record(self._target, sha256, url)
         self._sidecar.unlink(missing_ok=True)
         if self._expected is None:

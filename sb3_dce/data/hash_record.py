@@ -12,7 +12,7 @@ from sb3_dce.data.catalog import spec_of_file
 from sb3_dce.data.file_checks import read_head
 from sb3_dce.data.hashes import file_sha256
 from sb3_dce.errors import ConfigError, DatasetIntegrityError
-from sb3_dce.files import write_atomically
+from sb3_dce.files import write_text
 
 _MAX_BYTES = 2**16
 
@@ -127,5 +127,4 @@ def write_record(path: Path, sha256: str, url: str) -> None:
     """
     status, now = path.stat(), datetime.now(timezone.utc).isoformat(timespec="seconds")
     record = HashRecord(sha256, status.st_size, status.st_mtime_ns, now, url)
-    with write_atomically(record_path(path)) as stream:
-        stream.write(json.dumps(asdict(record), indent=2).encode())
+    write_text(record_path(path), json.dumps(asdict(record), indent=2))

@@ -63,6 +63,15 @@ def known_dataset(name_or_path: str | PathLike[str]) -> DatasetSpec | None:
         return None
 
 
+def catalogue_id(dataset: str | None) -> str | None:
+    """
+    :param dataset: id or file name
+    :return: id of the catalogue, ``None`` if it is not in there
+    """
+    spec = None if dataset is None else known_dataset(dataset)
+    return None if spec is None else spec.id
+
+
 def is_path(name_or_path: str | PathLike[str]) -> bool:
     """
     Whether a dataset is given by its file rather than by its name.

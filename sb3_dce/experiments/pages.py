@@ -11,7 +11,7 @@ from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.judging import Verdict
 from sb3_dce.experiments.reports import Report, count
 from sb3_dce.experiments.tables import TextTable, parts_of
-from sb3_dce.files import write_atomically
+from sb3_dce.files import write_text
 
 HEADINGS = {
     "scores": "Normalised scores",
@@ -56,8 +56,7 @@ def write_page(path: Path, out: Path, evidences: Mapping[str, Evidence], reports
     ]
     for name, report in reports.items():
         parts += _section(name, evidences[name], report, link)
-    with write_atomically(path) as stream:
-        stream.write("\n\n".join(part.strip("\n") for part in parts).encode() + b"\n")
+    write_text(path, "\n\n".join(part.strip("\n") for part in parts) + "\n")
 
 
 def _section(name: str, evidence: Evidence, report: Report, link: str) -> list[str]:

@@ -13,7 +13,7 @@ import pandas as pd
 from rich.console import Console
 from rich.table import Table
 
-from sb3_dce.checks import check_choice, check_device, check_ends_with_evaluation
+from sb3_dce.checks import check_choice, check_ends_with_evaluation
 from sb3_dce.data.catalog import resolve
 from sb3_dce.data.hashes import sha256_once
 from sb3_dce.data.locate import search
@@ -40,6 +40,7 @@ from sb3_dce.files import check_writable
 from sb3_dce.hyperparams import did_you_mean, full_name
 from sb3_dce.precision import PRECISIONS
 from sb3_dce.runs import RunSpec, refuse_other_run
+from sb3_dce.sb3_checks import check_device
 
 DEVICES = ("auto", "cpu", "cuda")
 ALL = "all"

@@ -22,9 +22,9 @@ import pandas as pd
 from sb3_dce.data import find_file
 from sb3_dce.data.catalog import resolve
 from sb3_dce.data.hashes import sha256_once
-from sb3_dce.data.locate import short_name
+from sb3_dce.data.locate import catalogue_id, short_name
 from sb3_dce.errors import CheckpointError, SB3DCEError
-from sb3_dce.evaluation import catalogue_id, read_evaluations
+from sb3_dce.evaluation import read_evaluations
 from sb3_dce.experiments.configuration import config_hash, differences
 from sb3_dce.experiments.grid import PlannedRun
 from sb3_dce.files import write_atomically

@@ -26,7 +26,7 @@ from sb3_dce.experiments.statistics import (
     sample_std,
     total,
 )
-from sb3_dce.files import write_atomically
+from sb3_dce.files import write_text
 
 BOLD_RULE = (
     "Bold: the 95 % bootstrap interval over seeds overlaps that of the best mean of the row (with one seed: the best mean). "
@@ -88,8 +88,7 @@ class TextTable:
         texts = {"md": self.markdown, "tex": self.latex, "csv": self.csv}
         for ending in endings:
             path, text = folder / f"{name}.{ending}", texts[ending]()
-            with write_atomically(path) as stream:
-                stream.write(text.encode())
+            write_text(path, text)
             written.append(path)
         return written
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from sb3_dce.data.npz import arrays_from_npz, write_npz
 from sb3_dce.errors import CheckpointError, ConfigError, DatasetError
-from sb3_dce.files import write_atomically
+from sb3_dce.files import write_text
 from sb3_dce.recording.episodes import Arrays, concatenate
 
 # Rows in memory before they are written: 10 MB, and seconds of work.
@@ -59,8 +59,7 @@ class Parts:
             return
         arrays = concatenate(self._waiting)
         if not self._settings_file.is_file():
-            with write_atomically(self._settings_file) as stream:
-                stream.write(json.dumps(self.settings, indent=1).encode())
+            write_text(self._settings_file, json.dumps(self.settings, indent=1))
         write_npz(self.folder / f"{self._waiting_from}-{self.n_episodes}.npz", arrays)
         self._whole.append(arrays)
         self._waiting, self._waiting_rows, self._waiting_from = [], 0, self.n_episodes

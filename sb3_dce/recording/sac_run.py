@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_dce.data.npz import arrays_from_npz, write_npz
 from sb3_dce.errors import CheckpointError, ConfigError
-from sb3_dce.files import write_atomically
+from sb3_dce.files import write_atomically, write_text
 from sb3_dce.numpy_policy import numpy_policy
 from sb3_dce.recording.episodes import Arrays, EpisodeRunner, RecordingSpec, concatenate, make_env
 from sb3_dce.recording.policy_files import write_npz_policy
@@ -214,8 +214,7 @@ class SACRun:
         with write_atomically(self.folder / f"model-{self.steps}.zip") as stream:
             model.save(stream)  # type: ignore[arg-type]
         state = {"config": self._config, **self._state}
-        with write_atomically(self.folder / "state.json") as stream:
-            stream.write(json.dumps(state, indent=1).encode())
+        write_text(self.folder / "state.json", json.dumps(state, indent=1))
         for old in self.folder.glob("model-*.zip"):
             if old.name != f"model-{self.steps}.zip":
                 old.unlink()

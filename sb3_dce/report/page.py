@@ -15,7 +15,7 @@ from sb3_dce.data.catalog import normalized_score
 from sb3_dce.data.hdf5 import D4RLFile
 from sb3_dce.data.transitions import Transitions
 from sb3_dce.errors import ConfigError, DatasetError
-from sb3_dce.files import write_atomically
+from sb3_dce.files import write_text
 from sb3_dce.report.behaviour import Behaviour, estimate_behaviour
 from sb3_dce.report.figures import Plot, draw_all
 from sb3_dce.report.verdict import Advice, advise
@@ -99,8 +99,7 @@ def write_report(
         out = Path(f"{name}-report.html")
         _require_replaceable(out, force)
     page = build_page(examination)
-    with write_atomically(out) as stream:
-        stream.write(page.encode("utf-8"))
+    write_text(out, page)
     return out, examination
 
 

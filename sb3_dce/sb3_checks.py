@@ -1,0 +1,125 @@
+"""Checks of what Stable-Baselines3 brings along: arguments of an agent, spaces, policies and callbacks."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
+
+from sb3_dce.checks import check_number, check_widths
+from sb3_dce.errors import ConfigError
+from sb3_dce.hyperparams import constructor_parameters
+
+
+def check_flags(owner: object) -> None:
+    """
+    :param owner: object with a constructor; each parameter that is declared ``bool`` must be one, since a text such as
+        "no" would count as true
+    :raises ConfigError: if one is not
+    """
+    for name, parameter in constructor_parameters(type(owner)).items():
+        value = getattr(owner, name, False)  # not every argument is kept
+        if parameter.annotation == "bool" and not isinstance(value, (bool, np.bool_)):
+            raise ConfigError(f"{name} must be True or False, got {value!r}", key=name, hint="Without quotation marks.")
+
+
+def check_device(device: Any) -> None:
+    """
+    :param device: as PyTorch names it, or "auto"
+    :raises ConfigError: if it is something else, or a CUDA device where there is none
+    """
+    if device == "auto":
+        return
+    try:
+        kind = th.device(device).type
+    except (RuntimeError, TypeError) as error:
+        hint = "For example 'auto', 'cpu', 'cuda' or 'cuda:1'."
+        raise ConfigError(f"device must be 'auto' or one of PyTorch's, got {device!r}", key="device", hint=hint) from error
+    if kind == "cuda" and not th.cuda.is_available():
+        raise ConfigError(f"device={device!r}, but PyTorch finds no CUDA device here", key="device", hint="Take 'auto'.")
+
+
+def check_policy_kwargs(given: Any, policy_class: type, settings: dict[str, Any]) -> None:
+    """
+    :param given: the user's ``policy_kwargs``
+    :param policy_class: policy they are for
+    :param settings: arguments of the policy that the agent's own parameters decide
+    :raises ConfigError: for something that is no dictionary, an unknown name, or one that the agent decides
+    """
+    if not isinstance(given, dict):
+        hint = "For example {'net_arch': [256, 256]}."
+        raise ConfigError(f"policy_kwargs must be a dictionary, got {given!r}", key="policy_kwargs", hint=hint)
+    parameters = inspect.signature(policy_class).parameters
+    takes_all = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values())
+    if not takes_all and (foreign := sorted(set(settings) - set(parameters))):
+        hint = "Derive it from the agent's own policy (sb3_dce.policies), which 'MlpPolicy' stands for."
+        what = f"{policy_class.__name__} does not take {', '.join(foreign)}, which this agent gives to its policy"
+        raise ConfigError(what, key="policy", hint=hint)
+    known = [name for name in parameters if name not in ("observation_space", "action_space", "lr_schedule", "use_sde")]
+    for name, value in given.items():
+        if name not in parameters and not takes_all:
+            hint = f"It has {', '.join(known)}."
+            raise ConfigError(f"{policy_class.__name__} has no parameter {name!r}", where="policy_kwargs", key=name, hint=hint)
+        if name == "features_extractor_class" and name in settings and not _extends(value, settings[name]):
+            whose, ours = getattr(value, "__name__", value), settings[name].__name__
+            hint = f"Set normalize_obs=False, or derive it from sb3_dce.networks.{ours}."
+            what = f"normalize_obs=True standardises observations in the features extractor, which {whose} would replace"
+            raise ConfigError(what, key=name, hint=hint)
+        if name in settings and name not in ("net_arch", "features_extractor_class"):
+            hint = "It follows from the agent's own parameters: set it there, or leave it out."
+            raise ConfigError(f"{name}={value!r} in policy_kwargs would contradict the agent", key=name, hint=hint)
+        if name == "net_arch" and value is not None:
+            check_widths("net_arch", value)
+        if name == "activation_fn" and not callable(value):
+            hint = "For example torch.nn.Tanh."
+            raise ConfigError(f"activation_fn must be a class of torch.nn, got {value!r}", key="activation_fn", hint=hint)
+        if name == "n_critics":
+            check_number("n_critics", value, 1, integer=True)
+
+
+def _extends(value: Any, base: type) -> bool:
+    return isinstance(value, type) and issubclass(value, base)
+
+
+def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+    """
+    :param observation_space: of an environment
+    :param action_space: of an environment
+    :raises ConfigError: if observations are no arrays of numbers, or actions have no finite bounds
+    """
+    if not isinstance(observation_space, spaces.Box):
+        raise ConfigError(
+            f"observations must be a Box, got {observation_space}",
+            key="env",
+            hint="Flatten them, for example with gymnasium.wrappers.FlattenObservation, in the data and the environment.",
+        )
+    if not isinstance(action_space, spaces.Box):
+        hint = "The agents of this package act continuously; there is none for discrete actions."
+        raise ConfigError(f"actions must be a Box, got {action_space}", key="env", hint=hint)
+    if not (np.isfinite(action_space.low).all() and np.isfinite(action_space.high).all()):
+        hint = "Bound them with gymnasium.wrappers.RescaleAction or a space of your own: agents act within the bounds."
+        raise ConfigError(f"actions must have finite bounds, got {action_space}", key="env", hint=hint)
+
+
+def callback_frequencies(callback: BaseCallback) -> list[tuple[str, int]]:
+    """
+    :param callback: callback, or a list or chain of them
+    :return: name and value of every frequency in it, in timesteps
+    """
+    found = [
+        (f"{type(callback).__name__}.{name}", getattr(callback, name))
+        for name in ("eval_freq", "save_freq", "n_steps")
+        if isinstance(getattr(callback, name, None), int)
+    ]
+    children: list[BaseCallback | None] = []
+    if isinstance(callback, CallbackList):
+        children = list(callback.callbacks)
+    elif isinstance(callback, EventCallback):
+        children = [callback.callback, getattr(callback, "callback_on_new_best", None)]
+    for child in children:
+        found += [] if child is None else callback_frequencies(child)
+    return found
