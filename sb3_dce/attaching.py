@@ -18,6 +18,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dce import hyperparams
 from sb3_dce.buffers import OfflineReplayBuffer
@@ -79,7 +80,7 @@ class AttachingMixin(OffPolicyAlgorithm):
         spec = None if isinstance(name, Transitions) else find_file(name)[1]
         row = hyperparams.load_row(_algo_with_rows(cls), None if spec is None else spec.id)
         arguments = {**hyperparams.split_row(row).kwargs, **overrides}
-        hyperparams.check_keys(cls, overrides, where=f"{cls.__name__}.load_dataset")
+        hyperparams.check_keys(cls, overrides, where=f"{cls.__name__}.load_dataset", zoo_keys=False)
         hyperparams.check_keys(cls, arguments, where=f"zoo_hyperparams/{cls.algo_name}.yml")
         arguments["dataset"] = name
         arguments["policy"] = policy or arguments.get("policy", "MlpPolicy")
@@ -88,6 +89,33 @@ class AttachingMixin(OffPolicyAlgorithm):
         elif env is None and is_minari_name(name):
             env = make_minari_env(name)
         return cls(env=env, **arguments)  # type: ignore[arg-type]
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """
+        Evaluate in another environment.
+
+        Spaces that were taken from the data know no bounds of observations; they become those of the environment.
+
+        :param env: environment with observations of the same shape, and with the actions of the model
+        :param force_reset: kept for Stable-Baselines3
+        :raises ConfigError: if its spaces are others
+        """
+        env = self._wrap_env(env, self.verbose)
+        self._take_spaces_of(env)
+        super().set_env(env, force_reset)
+
+    def _take_spaces_of(self, env: VecEnv) -> None:
+        for name, what in (("observation_space", "observations"), ("action_space", "actions")):
+            own, theirs = getattr(self, name), getattr(env, name)
+            fits = isinstance(theirs, spaces.Box) and theirs.shape == own.shape
+            if fits and not (name == "observation_space" and np.isinf(own.low).all() and np.isinf(own.high).all()):
+                fits = np.array_equal(own.low, theirs.low) and np.array_equal(own.high, theirs.high)
+            if not fits:
+                hint = "Use an environment with the spaces of the data, or read the data with its bounds (action_scale=)."
+                text = f"the {what} of the environment are {theirs}, those of the model {own}"
+                raise ConfigError(text, key="env", hint=hint)
+        for owner in (self, self.policy):
+            owner.observation_space, owner.action_space = env.observation_space, env.action_space
 
     def set_dataset(self, dataset: DatasetLike) -> None:
         """
@@ -98,6 +126,18 @@ class AttachingMixin(OffPolicyAlgorithm):
         self._remember_dataset(dataset)
         self._own_buffer().reset()
         self.dataset_statistics = None
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """
+        Write all rows into a pickle. A model needs it only if the data cannot be read again.
+
+        :param path: file
+        """
+        if self.dataset is not None:
+            size = self._own_buffer().size() * (2 * int(np.prod(self.observation_space.shape or ())) + 8) * 4 / 1e6
+            text = f"the replay buffer ({size:,.0f} MB) is a copy of {self.dataset}, which a loaded model reads by itself"
+            warnings.warn(text, DatasetWarning)
+        super().save_replay_buffer(path)
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """

@@ -17,7 +17,6 @@ from typing import Any, ClassVar, TypeVar
 import gymnasium as gym
 import numpy as np
 import torch as th
-from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
@@ -35,7 +34,15 @@ from sb3_dce.noise import NoiseSpec
 from sb3_dce.precision import PRECISIONS, matmul_precision
 from sb3_dce.processes import UninterruptedBlock
 from sb3_dce.saving import SavingMixin
-from sb3_dce.sb3_checks import callback_frequencies, check_device, check_flags, check_policy_kwargs, check_spaces
+from sb3_dce.sb3_checks import (
+    callback_frequencies,
+    check_device,
+    check_flags,
+    check_logging,
+    check_policy_kwargs,
+    check_spaces,
+    named_env,
+)
 from sb3_dce.state import Storage, TrainState
 
 SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
@@ -107,14 +114,17 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         device: th.device | str,
         needs_env: bool,
     ) -> None:
-        check_seed(seed)
+        seed = check_seed(seed)
         check_device(device)
+        check_logging(verbose, stats_window_size, tensorboard_log)
+        if isinstance(learning_rate, np.number):  # Stable-Baselines3 takes Python's numbers only
+            learning_rate = float(learning_rate)
         self.d4rl_compat = d4rl_compat
         spec = self._remember_dataset(dataset)
         if env is None and needs_env:
             env = self._spaces_env(spec, verbose)
         if env is not None:
-            env = maybe_make_env(env, verbose)
+            env = named_env(env, verbose)
             if isinstance(env, (gym.Env, VecEnv)):  # Stable-Baselines3 says what else it takes
                 check_spaces(env.observation_space, env.action_space)
         super().__init__(
@@ -245,7 +255,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         check_flags(self)
         check_number("batch_size", self.batch_size, 1, integer=True)
         check_number("gradient_steps", self.gradient_steps, 1, integer=True)
-        check_number("tau", self.tau, 0, 1, hint="The paper's Polyak coefficient is 0.005; its tau is called expectile.")
+        check_number("tau", self.tau, 0, 1, hint="Usual is 0.005. The paper's tau is the expectile.")
         check_number("gamma", self.gamma, 0, 1)
         check_number("reward_scale", self.reward_scale, 0, open_low=True)
         check_number("reward_shift", self.reward_shift, -float("inf"), open_low=True)
@@ -271,13 +281,18 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         self._stats_window_size = self.stats_window_size
         given, settings = self.policy_kwargs, self.policy_settings()
         check_policy_kwargs(given, self.policy_class, settings)
-        self.policy_kwargs = {**settings, **given}
+        defaults = {name for name, value in given.items() if name == "net_arch" and value is None}
+        self.policy_kwargs = {**settings, **{name: value for name, value in given.items() if name not in defaults}}
         try:
             super()._setup_model()
         finally:
             # The user's own arguments are what is saved and compared at load time.
             self.policy_kwargs = given
         for name in self.networks:
+            if not hasattr(self.policy, name):
+                ours = self.policy_aliases["MlpPolicy"].__name__
+                what = f"{type(self.policy).__name__} has no {name!r}, which {type(self).__name__} trains"
+                raise ConfigError(what, key="policy", hint=f"Use 'MlpPolicy', or derive the policy from sb3_dce's {ours}.")
             setattr(self, name, getattr(self.policy, name))
         self.setup_extras()
         self._engine = None
@@ -289,6 +304,7 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
             self._seed_generator(self.seed)
 
     def set_random_seed(self, seed: int | None = None) -> None:
+        seed = check_seed(seed)
         super().set_random_seed(seed)
         self._seed_generator(seed)
 
@@ -546,8 +562,8 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
             self._warned_large_q = True
             warnings.warn(
                 f"mean Q on the data is {metrics['q_data']:.3g} after {self._n_updates} updates, beyond 10 times the largest "
-                f"return the rewards allow ({bound:.3g}): the critics are diverging. Try a larger beta or a smaller "
-                "learning_rate.",
+                f"return the rewards allow ({bound:.3g}): the critics are diverging. Try a smaller "
+                f"learning_rate{' or a larger beta' if hasattr(self, 'beta') else ''}.",
                 SB3DCEWarning,
             )
 

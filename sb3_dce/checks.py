@@ -64,13 +64,16 @@ def check_choice(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
         raise ConfigError(what, key=name, hint="Give one of them, or leave it out for the default.")
 
 
-def check_seed(seed: Any) -> None:
+def check_seed(seed: Any) -> int | None:
     """
-    :param seed: ``None`` or a whole number that NumPy and PyTorch take
+    :param seed: ``None`` or a whole number, one of NumPy's, too
+    :return: the same as PyTorch takes it
     :raises ConfigError: if it is something else
     """
-    if seed is not None:
-        check_number("seed", seed, 0, LAST_SEED, integer=True, hint="None draws one.")
+    if seed is None:
+        return None
+    check_number("seed", seed, 0, LAST_SEED, integer=True, hint="None draws one.")
+    return int(seed)
 
 
 def check_steps(name: str, value: Any) -> int:
@@ -87,18 +90,16 @@ def check_steps(name: str, value: Any) -> int:
     return int(value)
 
 
-def check_widths(name: str, value: Any) -> None:
+def check_widths(name: str, value: Any, hint: str = "For example [256, 256].") -> None:
     """
     :param name: name of an argument with the widths of hidden layers
-    :param value: list of units per layer, or lists by network
+    :param value: list of units per layer
+    :param hint: what to do
     :raises ConfigError: if it is something else
     """
-    parts = value.values() if isinstance(value, dict) else [value]
-    for part in parts:
-        ok = isinstance(part, (list, tuple))
-        if not ok or any(isinstance(n, bool) or not isinstance(n, Integral) or n < 1 for n in part):
-            hint = "For example [256, 256], or {'pi': [256], 'qf': [256, 256]}."
-            raise ConfigError(f"{name} must be a list of numbers of units, got {value!r}", key=name, hint=hint)
+    ok = isinstance(value, (list, tuple))
+    if not ok or any(isinstance(n, bool) or not isinstance(n, Integral) or n < 1 for n in value):
+        raise ConfigError(f"{name} must be a list of numbers of units, got {value!r}", key=name, hint=hint)
 
 
 def check_ends_with_evaluation(n_updates: int, eval_freq: int, whose: str = "") -> None:

@@ -17,6 +17,7 @@ from sb3_dce.checks import check_choice, check_number, check_optional
 from sb3_dce.entropy import ENT_COEF, EntropyCoefficient, descend_ent_coef
 from sb3_dce.errors import ConfigError
 from sb3_dce.execution import Update
+from sb3_dce.hyperparams import constructor_parameters
 from sb3_dce.networks import OfflineCritic, ValueNet
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import OfflineSACPolicy
@@ -219,6 +220,9 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
         super().check_parameters()
         check_number("expectile", self.expectile, 0, 1, open_low=True, open_high=True, hint="The paper uses 0.7.")
         check_number("beta", self.beta, 0, hint="0 is SAC with V; the paper's values are in zoo_hyperparams/dce.yml.")
+        if self.beta_final is not None:
+            check_number("beta_final", self.beta_final, 0, hint="None keeps beta constant.")
+        check_number("beta_rate", self.beta_rate, -float("inf"), open_low=True, hint="0 keeps beta constant.")
         check_number("td_loss_coef", self.td_loss_coef, 0, open_low=True, hint="The paper's Eq. 6 is 1.")
         check_number("critic_dropout", self.critic_dropout, 0, 1, open_high=True, hint="The paper uses 0.1 on human data.")
         for name in ("beta_update_every", "steps_per_epoch", "n_penalty_actions", "policy_update_freq"):
@@ -246,19 +250,23 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
                 key="use_v",
                 hint="Set use_v=True, or choose another form.",
             )
+        if self.dropout_in_target and (self.critic_dropout == 0 or not self.use_v):
+            raise ConfigError(
+                "dropout_in_target=True drops units of the target critics that V learns from; it needs critic_dropout above 0 "
+                f"and use_v=True, got critic_dropout={self.critic_dropout} and use_v={self.use_v}",
+                key="dropout_in_target",
+                hint="Leave it out, or set critic_dropout=0.1 (the paper's value on human data).",
+            )
         self._beta_schedule()
 
     def _beta_schedule(self) -> StepSchedule:
         return StepSchedule.of(vars(self))
 
     def policy_settings(self) -> dict[str, Any]:
-        return {
-            **super().policy_settings(),
-            "use_v": self.use_v,
-            "use_target_v": self.use_target_v,
-            "critic_layer_norm": self.critic_layer_norm,
-            "critic_weight_decay": self.critic_weight_decay,
-        }
+        # Agents without such parameters of their own leave them to policy_kwargs.
+        own = constructor_parameters(type(self)).keys() & {"critic_layer_norm", "critic_weight_decay"}
+        settings = {name: getattr(self, name) for name in sorted(own)}
+        return {**super().policy_settings(), "use_v": self.use_v, "use_target_v": self.use_target_v, **settings}
 
     # -- what the base class needs ---------------------------------------------------------------------------------
 

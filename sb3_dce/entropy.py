@@ -26,7 +26,7 @@ def parse_ent_coef(ent_coef: str | float) -> tuple[bool, float]:
     learned = isinstance(ent_coef, str) and ent_coef.split("_")[0] == "auto"
     text = (ent_coef.partition("_")[2] or "1.0") if isinstance(ent_coef, str) and learned else ent_coef
     try:
-        value = float(text)
+        value = float("nan") if isinstance(ent_coef, bool) else float(text)
     except (TypeError, ValueError):
         value = float("nan")
     if not 0.0 <= value < math.inf or (learned and value == 0.0):

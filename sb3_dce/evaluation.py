@@ -15,7 +15,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_dce.checks import LAST_SEED, check_number
-from sb3_dce.data.catalog import normalized_score
+from sb3_dce.data.catalog import normalized_score, resolve
 from sb3_dce.errors import CheckpointError
 from sb3_dce.evaluation_pool import EvaluationPool
 from sb3_dce.files import check_writable, write_atomically, write_text
@@ -73,7 +73,9 @@ def evaluate(model: Any, rollouts: Rollouts, seed: int, dataset_id: str | None =
     :param seed: seed of the first environment
     :param dataset_id: defines the score
     :return: returns and lengths
+    :raises ConfigError: if the model does not fit the environments
     """
+    rollouts.check_fits(model)
     episodes = rollouts.play(deterministic_act(model), seed)
     return Evaluation(int(getattr(model, "_n_updates", 0)), *episodes, dataset_id)
 
@@ -123,7 +125,7 @@ class EvaluationCallback(BaseCallback):
         super().__init__()
         check_number("eval_freq", eval_freq, 1, integer=True, hint="The paper uses 5000.")
         self.rollouts = rollouts
-        self.dataset_id = dataset_id
+        self.dataset_id = None if dataset_id is None else resolve(dataset_id).id
         self.eval_freq = eval_freq
         self.seed = seed
         self.folder = folder
@@ -135,6 +137,8 @@ class EvaluationCallback(BaseCallback):
     def _on_training_start(self) -> None:
         if self.folder is not None:
             check_writable(self.folder / "evaluations.npz")  # not hours later
+        if self.rollouts is not None:
+            self.rollouts.check_fits(self.model)
 
     def _on_step(self) -> bool:
         if self.num_timesteps % self.eval_freq == 0:

@@ -99,7 +99,7 @@ def refuse_divergence(means: dict[str, float], first: int, last: int) -> None:
         named = ", ".join(bad[:4]) + (f" and {len(bad) - 4} more" if len(bad) > 4 else "")  # in a few updates all of them
         raise DivergenceError(
             f"training diverged between updates {first} and {last}: {named} not finite",
-            hint="Check the dataset for huge values, lower learning_rate or beta, or set max_grad_norm.",
+            hint="Check the dataset for huge values, lower learning_rate (and beta, if there is one), or set max_grad_norm.",
             index=last,
         )
 

@@ -19,9 +19,10 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_dce.checks import check_number
 from sb3_dce.data.catalog import resolve
-from sb3_dce.data.locate import catalogue_id
+from sb3_dce.data.locate import catalogue_id, is_path
 from sb3_dce.data.minari import is_minari_name
 from sb3_dce.envs import make_env_if_possible, make_minari_env, missing_simulator, without_bookkeeping
+from sb3_dce.errors import ConfigError
 from sb3_dce.locomotion import EnvSteps, fast_steps
 from sb3_dce.mlp_actor import MLPActor, actor_snapshot
 from sb3_dce.normalizing import vec_normalize_of
@@ -98,6 +99,22 @@ class Rollouts:
         self._limit: int | None = None
         self._steps: tuple[list[int], EnvSteps] | None = None
 
+    def check_fits(self, model: Any) -> None:
+        """
+        :param model: agent, or anything with ``predict``
+        :raises ConfigError: if it sees or does other things than the environments have
+        """
+        env = self._env(0)
+        for name, what in (("observation_space", "observations"), ("action_space", "actions")):
+            own, theirs = getattr(model, name, None), getattr(env, name)
+            if own is not None and own.shape != theirs.shape:
+                raise ConfigError(
+                    f"the model has {what} of shape {own.shape}, the environment to evaluate in of {theirs.shape}",
+                    where=self.dataset,
+                    key="dataset",
+                    hint="Name a dataset of the model's own environment, or use evaluate_policy(model, env) with it.",
+                )
+
     def play(self, act: Act, seed: int) -> Episodes:
         """
         All episodes.
@@ -151,11 +168,13 @@ class Rollouts:
 
     def _make_steps(self, rows: list[int]) -> EnvSteps:
         if self._steps is None or self._steps[0] != rows:
-            for row in rows:
-                if row not in self._envs:
-                    self._envs[row], self._limit = without_bookkeeping(self._make_env())
-            self._steps = (rows, fast_steps({row: self._envs[row] for row in rows}))
+            self._steps = (rows, fast_steps({row: self._env(row) for row in rows}))
         return self._steps[1]
+
+    def _env(self, row: int) -> gym.Env:
+        if row not in self._envs:
+            self._envs[row], self._limit = without_bookkeeping(self._make_env())
+        return self._envs[row]
 
     def close(self) -> None:
         """Close the environments."""
@@ -182,10 +201,13 @@ def rollouts_of(dataset: str | None, n_episodes: int, n_envs: int | None = None)
     :param n_episodes: episodes of an evaluation
     :param n_envs: environments that play them, see :class:`~sb3_dce.rollouts.Rollouts`
     :return: environments to evaluate in, or ``None`` where none is known or there is no simulator
+    :raises DatasetError: for a name that is neither known nor a file
     """
     dataset_id = catalogue_id(dataset)
     if dataset_id is not None:
         return make_rollouts(dataset_id, n_episodes, n_envs)
+    if dataset is not None and not is_path(dataset) and not is_minari_name(dataset):
+        resolve(dataset)  # which says what is known
     if not is_minari_name(dataset) or make_minari_env(dataset) is None:
         return None
 

@@ -174,8 +174,9 @@ def update(
     def pi_loss(params: th.Tensor) -> tuple[th.Tensor, tuple[th.Tensor, th.Tensor, th.Tensor]]:
         mean, log_std, _ = nets["actor"](params, s)
         actions, log_prob = losses.squashed_gaussian(mean, log_std, noise["actor"])
-        q_pi = losses.reduce_critics(nets["critic"](new["critic"].params, s, actions), "min")
-        return losses.sac_actor_loss(log_prob, q_pi, ent_coef), (actions, log_prob, q_pi)
+        q_pi = nets["critic"](new["critic"].params, s, actions)
+        loss = losses.sac_actor_loss(log_prob, losses.reduce_critics(q_pi, "min"), ent_coef)
+        return loss, (actions, log_prob, losses.reduce_critics(q_pi, "mean"))
 
     new["actor"], loss, kept, norm = descend(pi_loss, state["actor"], lr, settings["actor"], max_grad_norm)
     actions, log_prob, q_pi = kept

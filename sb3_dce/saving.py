@@ -33,7 +33,7 @@ MEMBERS = ("data", "policy.pth", "pytorch_variables.pth")
 READING = (zipfile.BadZipFile, zlib.error, pickle.UnpicklingError, EOFError, OSError, RuntimeError, LookupError)
 ARGUMENTS = (ValueError, TypeError, AttributeError)
 # Beginnings of its messages on arguments of ``load``, which are no damage.
-ABOUT_ARGUMENTS = ("The specified policy kwargs", "Observation spaces do not match", "Action spaces do not match")
+ABOUT_ARGUMENTS = ("The specified policy kwargs",)
 # Arguments that decide which rows of the data are trained on.
 CHOOSES_ROWS = frozenset({"fraction", "d4rl_compat"})
 # Not in the zip: what is large, what can be made again, and what SB3 would pickle although nothing needs it.
@@ -113,7 +113,7 @@ class SavingMixin(OffPolicyAlgorithm):
         :raises CheckpointError: if the file is missing, damaged or another agent's, or its parameters do not fit the
             (changed) configuration
         """
-        hyperparams.check_keys(cls, kwargs, where=f"{cls.__name__}.load")
+        hyperparams.check_keys(cls, kwargs, where=f"{cls.__name__}.load", zoo_keys=False)
         check_seed(kwargs.get("seed"))
         check_device(device)
         source, dataset = cls._own_file(path), kwargs.pop("dataset", None)
@@ -121,7 +121,7 @@ class SavingMixin(OffPolicyAlgorithm):
         _refuse_damage(source)
         file_alone = env is None and not custom_objects and not kwargs
         try:
-            model = super().load(source, env, device, custom_objects, print_system_info, force_reset, **kwargs)
+            model = super().load(source, None, device, custom_objects, print_system_info, force_reset, **kwargs)
         except SB3DCEError:
             raise
         except (*READING, *ARGUMENTS) as error:
@@ -133,6 +133,8 @@ class SavingMixin(OffPolicyAlgorithm):
             hint = "Its class has changed since it was saved, or the file is something else than model.save() writes."
             what = f"the model cannot be read: {text.splitlines()[0][:200]}"
             raise CheckpointError(what, where=_name_of(source), hint=hint) from error
+        if env is not None:
+            model.set_env(env, force_reset)
         if not isinstance(model.dataset, str | None):
             raise CheckpointError(f"its dataset is {model.dataset!r}", where=_name_of(source), hint=DAMAGED)
         _refuse_not_finite(model, CheckpointError, f"{_name_of(source)} cannot be used")
@@ -262,7 +264,7 @@ def _refuse_not_finite(model: Any, error: type[SB3DCEError], what: str) -> None:
             named += [(f"{name} ({key})", value) for state in states for key, value in state.items()]
     for name, tensor in named:
         if isinstance(tensor, th.Tensor) and not bool(th.isfinite(tensor).all()):
-            hint = "Go back to an earlier checkpoint; training needs a lower learning_rate or beta."
+            hint = "Go back to an earlier checkpoint; training needs a lower learning_rate, or another penalty."
             raise error(f"{what}: {name} is not finite", key=name, hint=hint)
 
 

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-import inspect
+import os
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
+from stable_baselines3.common.type_aliases import GymEnv
 
-from sb3_dce.checks import check_number, check_widths
+from sb3_dce.checks import check_choice, check_number, check_widths
 from sb3_dce.errors import ConfigError
 from sb3_dce.hyperparams import constructor_parameters
+
+# Arguments of the policies that follow from the agent, whether it says so or keeps to the default.
+AGENTS_CHOICE = frozenset({"use_v", "use_target_v"})
 
 
 def check_flags(owner: object) -> None:
@@ -43,6 +49,34 @@ def check_device(device: Any) -> None:
         raise ConfigError(f"device={device!r}, but PyTorch finds no CUDA device here", key="device", hint="Take 'auto'.")
 
 
+def check_logging(verbose: Any, stats_window_size: Any, tensorboard_log: Any) -> None:
+    """
+    :param verbose: 0, 1 or 2
+    :param stats_window_size: episodes, at least 1
+    :param tensorboard_log: folder or ``None``
+    :raises ConfigError: if one is something else
+    """
+    check_choice("verbose", verbose, (0, 1, 2))
+    check_number("stats_window_size", stats_window_size, 1, integer=True)
+    if not isinstance(tensorboard_log, str | os.PathLike | None):
+        hint = "None writes none."
+        raise ConfigError(f"tensorboard_log must be a folder, got {tensorboard_log!r}", key="tensorboard_log", hint=hint)
+
+
+def named_env(env: GymEnv | str, verbose: int) -> GymEnv:
+    """
+    :param env: environment, or id of one
+    :param verbose: 1 lets Stable-Baselines3 say what it makes
+    :return: the environment
+    :raises ConfigError: for an unknown id
+    """
+    try:
+        return maybe_make_env(env, verbose)
+    except gym.error.Error as error:
+        hint = "Give an id that gymnasium.make knows, an environment, or leave it out."
+        raise ConfigError(f"no environment {env!r}: {error}", key="env", hint=hint) from error
+
+
 def check_policy_kwargs(given: Any, policy_class: type, settings: dict[str, Any]) -> None:
     """
     :param given: the user's ``policy_kwargs``
@@ -53,15 +87,14 @@ def check_policy_kwargs(given: Any, policy_class: type, settings: dict[str, Any]
     if not isinstance(given, dict):
         hint = "For example {'net_arch': [256, 256]}."
         raise ConfigError(f"policy_kwargs must be a dictionary, got {given!r}", key="policy_kwargs", hint=hint)
-    parameters = inspect.signature(policy_class).parameters
-    takes_all = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values())
-    if not takes_all and (foreign := sorted(set(settings) - set(parameters))):
+    parameters = constructor_parameters(policy_class)
+    if foreign := sorted(set(settings) - set(parameters)):
         hint = "Derive it from the agent's own policy (sb3_dce.policies), which 'MlpPolicy' stands for."
         what = f"{policy_class.__name__} does not take {', '.join(foreign)}, which this agent gives to its policy"
         raise ConfigError(what, key="policy", hint=hint)
     known = [name for name in parameters if name not in ("observation_space", "action_space", "lr_schedule", "use_sde")]
     for name, value in given.items():
-        if name not in parameters and not takes_all:
+        if name not in parameters:
             hint = f"It has {', '.join(known)}."
             raise ConfigError(f"{policy_class.__name__} has no parameter {name!r}", where="policy_kwargs", key=name, hint=hint)
         if name == "features_extractor_class" and name in settings and not _extends(value, settings[name]):
@@ -69,16 +102,35 @@ def check_policy_kwargs(given: Any, policy_class: type, settings: dict[str, Any]
             hint = f"Set normalize_obs=False, or derive it from sb3_dce.networks.{ours}."
             what = f"normalize_obs=True standardises observations in the features extractor, which {whose} would replace"
             raise ConfigError(what, key=name, hint=hint)
-        if name in settings and name not in ("net_arch", "features_extractor_class"):
+        if name in AGENTS_CHOICE or (name in settings and name not in ("net_arch", "features_extractor_class")):
             hint = "It follows from the agent's own parameters: set it there, or leave it out."
             raise ConfigError(f"{name}={value!r} in policy_kwargs would contradict the agent", key=name, hint=hint)
         if name == "net_arch" and value is not None:
-            check_widths("net_arch", value)
+            _check_net_arch(value)
         if name == "activation_fn" and not callable(value):
             hint = "For example torch.nn.Tanh."
             raise ConfigError(f"activation_fn must be a class of torch.nn, got {value!r}", key="activation_fn", hint=hint)
         if name == "n_critics":
             check_number("n_critics", value, 1, integer=True)
+        if name == "critic_weight_decay":
+            check_number("critic_weight_decay", value, 0)
+        if name == "optimizer_class" and not _extends(value, th.optim.Optimizer):
+            hint = "Give torch.optim.Adam or torch.optim.AdamW, the class itself."
+            raise ConfigError(f"optimizer_class must be an optimizer of torch, got {value!r}", key=name, hint=hint)
+        if name == "optimizer_kwargs" and value is not None and (not isinstance(value, dict) or "lr" in value):
+            hint = "For example {'eps': 1e-5}; the learning rate is the agent's learning_rate."
+            raise ConfigError(f"optimizer_kwargs must be a dictionary without 'lr', got {value!r}", key=name, hint=hint)
+
+
+def _check_net_arch(value: Any) -> None:
+    if not isinstance(value, dict):
+        check_widths("net_arch", value, "For example [256, 256], or {'pi': [256], 'qf': [256, 256]}.")
+        return
+    if set(value) != {"pi", "qf"}:
+        hint = "For example {'pi': [256], 'qf': [256, 256]}: of the actor, and of the critics and V."
+        raise ConfigError(f"net_arch must name 'pi' and 'qf', got {sorted(map(str, value))}", key="net_arch", hint=hint)
+    for name, part in value.items():
+        check_widths(f"net_arch[{name!r}]", part)
 
 
 def _extends(value: Any, base: type) -> bool:

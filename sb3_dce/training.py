@@ -123,7 +123,8 @@ def evaluate_file(model_path: Path, dataset: str | None, n_episodes: int, seed: 
         raise ConfigError(
             f"no environment is known for {model.dataset!r}, on which the model was trained",
             key="dataset",
-            hint="Name a dataset of its environment with --dataset, for example --dataset halfcheetah-medium.",
+            hint="Data of your own name none: use evaluate_policy(model, env) of Stable-Baselines3. Where a known dataset has "
+            "the same environment, name that with --dataset.",
         )
     return evaluate(model, rollouts, seed, dataset_id)
 

@@ -20,7 +20,7 @@ from sb3_dce.noise import NoiseSpec
 from sb3_dce.state import PureNet, Storage
 from sb3_dce.steps import descend, polyak, q_data_metrics
 from sb3_dce.uwac_networks import ActionVAE, DropoutCritic
-from sb3_dce.uwac_policy import UWACPolicy
+from sb3_dce.uwac_policy import VAE_NET_ARCH, UWACPolicy
 
 # Names in the state tree: the multiplier of the MMD constraint, and the vectors of the critics' power iteration.
 LOG_ALPHA = "log_alpha"
@@ -193,14 +193,14 @@ class OfflineUWAC(ActorLearningRate, OfflineAlgorithm):
         check_optional("max_grad_norm", self.max_grad_norm)
 
     def policy_settings(self) -> dict[str, Any]:
-        settings = {
+        return {
             **super().policy_settings(),
             "critic_dropout": self.critic_dropout,
             "n_mc_dropout": self.n_mc_dropout,
             "n_predict_actions": self.n_predict_actions,
-            "predict_seed": 0 if self.seed is None else self.seed,
+            "vae_net_arch": VAE_NET_ARCH if self.vae_net_arch is None else self.vae_net_arch,
+            "critic_layer_norm": False,  # these critics have spectral normalisation
         }
-        return settings if self.vae_net_arch is None else {**settings, "vae_net_arch": self.vae_net_arch}
 
     def setup_extras(self) -> None:
         """Create the multiplier of the MMD constraint and its optimizer."""
@@ -367,7 +367,7 @@ def update(
         q_pi = q.mean(dim=-2).amin(dim=0).squeeze(0).unsqueeze(-1)
         variances = q.detach().var(dim=-2).sum(dim=0).squeeze(0).unsqueeze(-1)
         loss = loss - losses.batch_mean(q_pi * losses.uncertainty_weight(variances, coef["uwac_beta"]))
-        return loss, (mmd, a_pi, log_prob, q_pi, variances)
+        return loss, (mmd, a_pi, log_prob, q.detach().mean(), variances)
 
     rate = coef["actor_learning_rate"]
     new["actor"], loss, (mmd, a_pi, log_prob, *q_kept), norm = descend(pi_loss, state["actor"], rate, settings["actor"], clip)
@@ -375,7 +375,7 @@ def update(
     metrics.update(action_dist=(a_pi - a).abs().mean(), action_sat=(a_pi.abs() > 0.99).to(a_pi.dtype).mean())
     if not mmd_only:
         q_pi, variances = q_kept
-        metrics.update(q_policy=q_pi.mean(), q_gap=q_pi.mean() - q_data.mean(), policy_variance=variances.mean())
+        metrics.update(q_policy=q_pi, q_gap=q_pi - q_data.mean(), policy_variance=variances.mean())
         metrics["policy_weight"] = losses.uncertainty_weight(variances, coef["uwac_beta"]).mean()
 
     # 5 multiplier: ascends on the actor loss, in which the actor saw it before its step

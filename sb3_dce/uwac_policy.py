@@ -13,6 +13,8 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from sb3_dce.policies import OfflineSACPolicy
 from sb3_dce.uwac_networks import BLOCK_ROWS, ActionVAE, DropoutCritic
 
+VAE_NET_ARCH = [750, 750]
+
 
 class UWACPolicy(OfflineSACPolicy):
     """
@@ -20,7 +22,7 @@ class UWACPolicy(OfflineSACPolicy):
 
     As in the authors' code the action is the one of ``n_predict_actions`` draws of the actor with the largest value, the
     first critic's mean over its dropout passes. With ``deterministic=False`` draws and masks are new at every call, which
-    is their evaluation. With ``deterministic=True`` they are those of ``predict_seed``, at every call and for every state:
+    is their evaluation. With ``deterministic=True`` they are those of ``predict_seed`` (the same for every agent), at every call and for every state:
     the action is then a function of the observation alone, also after loading. All candidates of a call are valued with the
     same masks. Other parameters as :class:`~sb3_dce.policies.OfflineSACPolicy`.
 
@@ -43,7 +45,7 @@ class UWACPolicy(OfflineSACPolicy):
         n_mc_dropout: int = 100,
         n_predict_actions: int = 100,
         predict_seed: int = 0,
-        vae_net_arch: Sequence[int] = (750, 750),
+        vae_net_arch: Sequence[int] = VAE_NET_ARCH,
         **kwargs: Any,
     ) -> None:
         self.critic_dropout = critic_dropout

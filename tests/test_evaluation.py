@@ -40,7 +40,8 @@ def test_evaluation_that_is_made_again_takes_the_place_of_the_old_one(transition
         seeds.append(seed)
         return SimpleNamespace(result=lambda: Episodes((9.0,), (3,)))
 
-    callback = EvaluationCallback(object(), None, 4, seed=2, folder=tmp_path)  # type: ignore[arg-type]
+    rollouts: Any = SimpleNamespace(check_fits=lambda model: None)
+    callback = EvaluationCallback(rollouts, None, 4, seed=2, folder=tmp_path)
     callback.pool = SimpleNamespace(n_workers=0, submit=submit, close=lambda: None)  # type: ignore[assignment]
     OfflineBC("MlpPolicy", dataset=transitions, policy_kwargs={"net_arch": [4]}, batch_size=8, seed=0).learn(4, callback)
     assert [(e.n_updates, e.returns) for e in read_evaluations(tmp_path, None)] == [(4, (9.0,))]

@@ -71,6 +71,9 @@ def not_hdf5(path: Path, head: bytes, hint: str) -> DatasetIntegrityError:
     """
     if not head:
         what = "the file is empty (0 bytes)"
+    elif not head.startswith(HDF5_SIGNATURE) and path.suffix.lower() not in (".hdf5", ".h5", ""):
+        what = f"{path.suffix} is none of the formats that are read: HDF5 (.hdf5, .h5), .npz, .csv, .parquet"
+        hint = "Give data frames and arrays to sb3_dce.load_dataset, or write one of these"
     elif not head.startswith(HDF5_SIGNATURE):
         what = f"not an HDF5 file: an error page? It begins with {head[:60]!r}"
     else:

@@ -147,7 +147,7 @@ SPACES = {
     "cql_eq18": SearchSpace(convert_critic_params, (_optimizer, _bootstrap, _beta)),
     "offline_cql": SearchSpace(convert_critic_params, (_optimizer, _bootstrap, _actor_rate, _cql)),
     "offline_pbrl": SearchSpace(convert_pbrl_params, (_optimizer, _bootstrap, _actor_rate, _pbrl)),
-    "offline_uwac": SearchSpace(convert_critic_params, (_optimizer, _bootstrap, _uwac)),
+    "offline_uwac": SearchSpace(convert_critic_params, (_optimizer, _bootstrap, _actor_rate, _uwac)),
 }
 SAMPLERS = {algo: space.sample for algo, space in SPACES.items()}
 CONVERTERS = {algo: space.convert for algo, space in SPACES.items()}

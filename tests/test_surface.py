@@ -1,0 +1,228 @@
+"""The public surface side by side: every agent takes, refuses and says the same things in the same way."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.sac.policies import SACPolicy
+from torch import nn
+
+from sb3_dce import OfflineBC, OfflineDCE, OfflineSACV, OfflineTD3BC, OfflineUWAC, Transitions
+from sb3_dce.base import OfflineAlgorithm
+from sb3_dce.data import load_transitions
+from sb3_dce.envs import SpacesEnv
+from sb3_dce.errors import ConfigError, DatasetError, DatasetIntegrityError, DatasetWarning, SB3DCEWarning
+from sb3_dce.evaluation import EvaluationCallback, evaluate
+from sb3_dce.rollouts import make_rollouts, rollouts_of
+from tests.commands import sb3_dce
+from tests.test_agents import AGENTS, Agent, make
+
+TINY = "halfcheetah-tiny-sb3"
+
+
+@pytest.fixture(params=AGENTS)
+def agent(request: pytest.FixtureRequest) -> Agent:
+    return AGENTS[request.param]
+
+
+class Bounded(gym.Wrapper[Any, Any, Any, Any]):
+    """An environment that announces bounds of its observations, in single precision, as Pendulum does."""
+
+    def __init__(self, env: gym.Env[Any, Any], bound: float = 8.0, actions: float = 1.0) -> None:
+        super().__init__(env)
+        assert env.observation_space.shape is not None and env.action_space.shape is not None
+        self.observation_space = spaces.Box(-bound, bound, env.observation_space.shape, np.float32)
+        self.action_space = spaces.Box(-actions, actions, env.action_space.shape, np.float32)
+
+
+# -- environments ------------------------------------------------------------------------------------------------------
+
+
+def test_an_environment_with_bounds_can_be_given_later(
+    transitions: Transitions, make_point_mass: Callable[[], gym.Env], tmp_path: Path
+) -> None:
+    model = OfflineBC("MlpPolicy", dataset=transitions, batch_size=8, policy_kwargs={"net_arch": [8]}).learn(2)
+    model.save(tmp_path / "model.zip")
+    env = Bounded(make_point_mass())
+    for with_env in (model, OfflineBC.load(tmp_path / "model.zip"), OfflineBC.load(tmp_path / "model.zip", env=env)):
+        with_env.set_env(env)
+        assert with_env.observation_space == with_env.policy.observation_space == env.observation_space
+        with_env.set_dataset(transitions)
+        with_env.learn(1, reset_num_timesteps=False)
+    with_env.save(tmp_path / "again.zip")
+    assert OfflineBC.load(tmp_path / "again.zip", env=env).get_env() is not None
+    obs = env.reset(seed=0)[0]
+    actions = [m.predict(obs, deterministic=True)[0] for m in (OfflineBC.load(tmp_path / "again.zip"), with_env)]
+    assert np.array_equal(*actions)
+
+
+@pytest.mark.parametrize("given_at", ["set_env", "load"])
+def test_an_environment_with_other_actions_is_refused(
+    given_at: str, transitions: Transitions, make_point_mass: Callable[[], gym.Env], tmp_path: Path
+) -> None:
+    model = OfflineBC("MlpPolicy", dataset=transitions, policy_kwargs={"net_arch": [8]})
+    model.save(tmp_path / "model.zip")
+    env = Bounded(make_point_mass(), actions=2.0)
+    with pytest.raises(ConfigError, match=r"actions of the environment are Box\(-2.*those of the model Box\(-1.*action_scale"):
+        model.set_env(env) if given_at == "set_env" else OfflineBC.load(tmp_path / "model.zip", env=env)
+
+
+def test_known_bounds_of_observations_are_not_given_up(
+    transitions: Transitions, make_point_mass: Callable[[], gym.Env]
+) -> None:
+    model = OfflineBC("MlpPolicy", Bounded(make_point_mass()), transitions, policy_kwargs={"net_arch": [8]})
+    with pytest.raises(ConfigError, match="observations of the environment"):
+        model.set_env(Bounded(make_point_mass(), bound=9.0))
+
+
+def test_a_model_is_not_evaluated_where_it_does_not_belong(transitions: Transitions, tmp_path: Path) -> None:
+    model = OfflineBC("MlpPolicy", dataset=transitions, policy_kwargs={"net_arch": [8]})
+    rollouts = make_rollouts(TINY, 1)
+    assert rollouts is not None
+    message = r"model has observations of shape \(5,\), the environment to evaluate in of \(17,\)"
+    with pytest.raises(ConfigError, match=message):
+        evaluate(model, rollouts, seed=0)
+    with pytest.raises(ConfigError, match=message):
+        model.learn(1, callback=EvaluationCallback(rollouts, TINY, eval_freq=1))
+    model.save(tmp_path / "model.zip")
+    outcome = sb3_dce("evaluate", str(tmp_path / "model.zip"), "--dataset", TINY)
+    assert outcome.code == 2 and "observations of shape (5,)" in outcome.stderr and "Traceback" not in outcome.stderr
+
+
+def test_a_mistyped_dataset_is_no_reason_to_evaluate_nothing() -> None:
+    for call in (lambda: rollouts_of("halfcheetah-mediun", 1), lambda: EvaluationCallback(None, "halfcheetah-mediun", 1)):
+        with pytest.raises(DatasetError, match="Did you mean halfcheetah-medium"):
+            call()
+
+
+# -- arguments ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"verbose": "yes"}, "verbose must be one of 0, 1, 2"),
+        ({"stats_window_size": 0}, "stats_window_size must be an integer"),
+        ({"tensorboard_log": 3}, "tensorboard_log must be a folder"),
+        ({"env": "HalfCheeta-v4"}, "no environment 'HalfCheeta-v4'"),
+        ({"policy_kwargs": {"net_arc": [8]}}, "no parameter 'net_arc'"),
+        ({"policy_kwargs": {"use_sde": True}}, "no parameter 'use_sde'"),
+        ({"policy_kwargs": {"critic_weight_decay": -1.0}}, "critic_weight_decay"),
+        ({"policy_kwargs": {"use_v": True}}, "use_v=True in policy_kwargs would contradict"),
+        ({"policy_kwargs": {"net_arch": {"pi": [8], "vf": [8]}}}, r"must name 'pi' and 'qf', got \['pi', 'vf'\]"),
+        ({"policy_kwargs": {"net_arch": {"pi": [8], "qf": 8}}}, r"net_arch\['qf'\] must be a list"),
+        ({"policy_kwargs": {"optimizer_kwargs": {"lr": 3.0}}}, "optimizer_kwargs must be a dictionary without 'lr'"),
+        ({"policy_kwargs": {"optimizer_class": "adam"}}, "optimizer_class must be an optimizer of torch"),
+        ({"seed": -1}, "seed must be an integer"),
+    ],
+)
+def test_every_agent_refuses_alike(agent: Agent, arguments: dict[str, Any], message: str, transitions: Transitions) -> None:
+    if arguments.get("policy_kwargs", {}).keys() & inspect.signature(agent.cls).parameters.keys():
+        message = "would contradict"  # it is the agent's own parameter
+    with pytest.raises(ConfigError, match=message):
+        agent.cls("MlpPolicy", **{"dataset": transitions, **agent.kwargs, **arguments})
+
+
+@pytest.mark.parametrize("policy", [SACPolicy, ActorCriticPolicy])
+def test_a_policy_of_another_algorithm_is_refused_in_words(policy: type, transitions: Transitions) -> None:
+    with pytest.raises(ConfigError, match=r"(does not take|no 'actor|has no parameter)"):
+        OfflineTD3BC(policy, dataset=transitions)
+
+
+def test_numbers_of_numpy_are_numbers(agent: Agent, transitions: Transitions) -> None:
+    model = make(agent, dataset=transitions, seed=np.int64(3), learning_rate=np.float32(1e-3), gradient_steps=np.int64(1))
+    model.learn(np.int64(2))
+    again = make(agent, dataset=transitions, seed=3, learning_rate=float(np.float32(1e-3))).learn(2)
+    for one, other in zip(model.policy.parameters(), again.policy.parameters(), strict=True):
+        assert th.equal(one, other)
+
+
+def test_another_seed_at_load_changes_no_prediction(agent: Agent, transitions: Transitions, tmp_path: Path) -> None:
+    model = make(agent, dataset=transitions, seed=5).learn(2)
+    model.save(tmp_path / "model.zip")
+    obs = np.random.default_rng(0).standard_normal((7, 5))
+    loaded = agent.cls.load(tmp_path / "model.zip", seed=0)
+    assert np.array_equal(loaded.predict(obs, deterministic=True)[0], model.predict(obs, deterministic=True)[0])
+
+
+def test_default_network_stays_where_none_is_named(agent: Agent, transitions: Transitions) -> None:
+    kwargs = {**agent.kwargs, "dataset": transitions, "seed": 0}
+    plain, named = agent.cls("MlpPolicy", **kwargs), agent.cls("MlpPolicy", **kwargs, policy_kwargs={"net_arch": None})
+    assert [p.shape for p in plain.policy.parameters()] == [p.shape for p in named.policy.parameters()]
+
+
+def test_keys_of_the_zoo_are_no_arguments_of_an_agent(transitions: Transitions, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no parameter 'normalize'"):
+        OfflineDCE.load_dataset(transitions, normalize=True)
+    OfflineDCE("MlpPolicy", dataset=transitions, policy_kwargs={"net_arch": [8]}).save(tmp_path / "model.zip")
+    with pytest.raises(ConfigError, match="no parameter 'n_envs'"):
+        OfflineDCE.load(tmp_path / "model.zip", n_envs=3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"dropout_in_target": True}, "needs critic_dropout above 0"),
+        ({"dropout_in_target": True, "critic_dropout": 0.1, "use_v": False}, "use_v=True, got .* use_v=False"),
+        ({"beta_final": "x"}, "beta_final must be a number"),
+        ({"beta_final": float("nan"), "beta_rate": 0.5}, "beta_final must be a number"),
+        ({"beta_final": -3.0, "beta_rate": 0.5}, r"beta_final must be a number in \[0"),
+        ({"beta_final": 0.1, "beta_rate": float("nan")}, "beta_rate must be a number"),
+        ({"ent_coef": True}, "ent_coef must be a number"),
+    ],
+)
+def test_dce_refuses_at_once(arguments: dict[str, Any], message: str, transitions: Transitions) -> None:
+    with pytest.raises(ConfigError, match=message):
+        OfflineDCE("MlpPolicy", dataset=transitions, **arguments)
+
+
+def test_uwac_refuses_what_its_networks_do_not_have(transitions: Transitions) -> None:
+    for kwargs in ({"critic_layer_norm": True}, {"vae_net_arch": [-8]}):
+        with pytest.raises(ConfigError, match="would contradict the agent"):
+            OfflineUWAC("MlpPolicy", dataset=transitions, policy_kwargs=kwargs)
+    with pytest.raises(ConfigError, match=r"vae_net_arch must be a list .* For example \[256, 256\]\.$"):
+        OfflineUWAC("MlpPolicy", dataset=transitions, vae_net_arch={"pi": [8]})
+
+
+def test_variant_of_dce_takes_choices_of_the_critics_in_policy_kwargs(transitions: Transitions) -> None:
+    model = OfflineSACV("MlpPolicy", dataset=transitions, policy_kwargs={"net_arch": [8], "critic_layer_norm": True})
+    assert any(isinstance(module, nn.LayerNorm) for module in model.critic.modules())
+
+
+def test_messages_speak_of_parameters_the_agent_has(transitions: Transitions) -> None:
+    for cls, named in ((OfflineDCE, True), (OfflineTD3BC, False)):
+        model: OfflineAlgorithm = cls("MlpPolicy", dataset=transitions, policy_kwargs={"net_arch": [8]})
+        model.attach_dataset()
+        with pytest.warns(SB3DCEWarning, match="critics are diverging") as caught:
+            model._warn_of_large_values({"q_data": 1e9})
+        assert ("larger beta" in str(caught[0].message)) is named
+
+
+# -- files -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["log.tsv", "log.json", "log.npy"])
+def test_a_file_of_another_kind_is_not_called_a_broken_download(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(b"a\tb\n1\t2\n")
+    with pytest.raises(DatasetIntegrityError, match=rf"{name[3:]} is none of the formats that are read: HDF5.*load_dataset"):
+        load_transitions(tmp_path / name)
+
+
+def test_writing_a_copy_of_the_data_is_said(tmp_path: Path) -> None:
+    model = OfflineBC("MlpPolicy", SpacesEnv(*_spaces()), TINY, policy_kwargs={"net_arch": [8]})
+    model.attach_dataset()
+    with pytest.warns(DatasetWarning, match=rf"\(1 MB\) is a copy of {TINY}"):
+        model.save_replay_buffer(tmp_path / "buffer.pkl")
+
+
+def _spaces() -> tuple[spaces.Box, spaces.Box]:
+    return spaces.Box(-np.inf, np.inf, (17,), np.float64), spaces.Box(-1.0, 1.0, (6,), np.float32)
