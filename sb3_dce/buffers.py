@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import warnings
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from stable_baselines3.common.utils import get_device
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_dce.data.transitions import Transitions
-from sb3_dce.errors import ConfigError, DatasetFormatError, DatasetSemanticsError
+from sb3_dce.errors import ConfigError, DatasetFormatError, DatasetSemanticsError, DatasetWarning
 
 # Rows handled at once when a column has to be rewritten; 64k rows of HalfCheetah are 10 MB.
 CHUNK_ROWS = 65_536
@@ -111,6 +112,7 @@ class OfflineReplayBuffer(ReplayBuffer):
                 hint="Use the environment the data were recorded in, or another dataset.",
             )
         self._refuse_actions_outside(transitions)
+        self._warn_of_other_bounds(transitions)
         rows, timeouts = th.from_numpy(transitions._base_rows), transitions.timeouts
         if row_numbers is not None:
             rows, timeouts = rows[th.from_numpy(row_numbers)], timeouts[row_numbers]
@@ -130,6 +132,19 @@ class OfflineReplayBuffer(ReplayBuffer):
                 where=str(info.path or info.id),
                 hint="Use an environment with the action space of the data, or none: then its bounds are those of the data.",
                 key="actions",
+            )
+
+    def _warn_of_other_bounds(self, transitions: Transitions) -> None:
+        """Replay buffers and policies keep actions in [-1, 1]; taken for the environment's units they are too small."""
+        space, info = self.action_space, transitions.info
+        assert isinstance(space, spaces.Box)
+        bounds = ((space.low, info.action_space_low), (space.high, info.action_space_high))
+        if not all(np.allclose(np.ravel(own), theirs, rtol=1e-5) for own, theirs in bounds):
+            warnings.warn(
+                f"the environment has actions from {space.low.min():g} to {space.high.max():g}, the data were read as actions "
+                f"from {info.action_space_low.min():g} to {info.action_space_high.max():g}. If they are in the environment's "
+                "units, read them with its bounds (action_low=, action_high=); if they are scaled, scale them back first",
+                DatasetWarning,
             )
 
     def _with_scaled_actions(self, rows: th.Tensor) -> th.Tensor:

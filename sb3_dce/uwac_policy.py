@@ -22,9 +22,9 @@ class UWACPolicy(OfflineSACPolicy):
 
     As in the authors' code the action is the one of ``n_predict_actions`` draws of the actor with the largest value, the
     first critic's mean over its dropout passes. With ``deterministic=False`` draws and masks are new at every call, which
-    is their evaluation. With ``deterministic=True`` they are those of ``predict_seed`` (the same for every agent), at every call and for every state:
-    the action is then a function of the observation alone, also after loading. All candidates of a call are valued with the
-    same masks. Other parameters as :class:`~sb3_dce.policies.OfflineSACPolicy`.
+    is their evaluation. With ``deterministic=True`` they are those of ``predict_seed`` (the same for every agent), at every
+    call and for every state: the action is then a function of the observation alone, also after loading. All candidates of
+    a call are valued with the same masks. Other parameters as :class:`~sb3_dce.policies.OfflineSACPolicy`.
 
     :param critic_dropout: probability that a hidden unit of the critics is dropped
     :param n_mc_dropout: dropout passes

@@ -47,7 +47,7 @@ def test_clean_data_pass_every_check(tmp_path: Path) -> None:
     assert [check for check in examination.checks if check.verdict != "ok"] == []
     assert examination.verdict == "ok" and examination.error is None
     names = [check.name for check in examination.checks]
-    assert len(names) == len(set(names)) == 19
+    assert len(names) == len(set(names)) == 21
 
 
 def _set(key: str, index: Any, value: Any) -> Callable[[Arrays], None]:

@@ -70,7 +70,7 @@ def stacked(per_env: list[dict[str, np.ndarray]], keep: int) -> dict[str, np.nda
 
 
 def assert_equal(got: dict[str, np.ndarray], expected: dict[str, np.ndarray]) -> None:
-    assert set(got) == set(expected)
+    assert set(got) - {"incomplete"} == set(expected)
     for key, array in expected.items():
         check = np.testing.assert_allclose if key == "actions" else np.testing.assert_array_equal
         check(got[key], array, **({"rtol": 0, "atol": 2e-6} if key == "actions" else {}), err_msg=key)
@@ -105,9 +105,9 @@ def test_memory_saving_buffer_gets_next_observations_by_shift(n_envs: int, n_ste
     expected = stacked(per_env, keep)
     following = expected.pop("next_observations")
     with pytest.warns(DatasetWarning, match="all count as true ends"):
-        arrays = arrays_from_replay_buffer(buffer)
-    assert_equal(arrays, expected)
-    transitions = Transitions.from_arrays(**arrays)
+        assert_equal(arrays_from_replay_buffer(buffer), expected)
+    with pytest.warns(DatasetWarning):
+        transitions = Transitions.from_replay_buffer(buffer)
     last = np.arange(1, n_envs + 1) * keep - 1
     used = np.delete(np.arange(n_envs * keep), last[~expected["terminals"][last]])
     goes_on = transitions.terminals == 0

@@ -21,7 +21,7 @@ from sb3_dce import hyperparams, theory
 from sb3_dce.data.catalog import DatasetSpec, spec_of_file
 from sb3_dce.data.layout import row_blocks
 from sb3_dce.data.loading import load_transitions
-from sb3_dce.data.quality import HUGE_VALUE
+from sb3_dce.data.quality import HUGE_REWARD, HUGE_VALUE
 from sb3_dce.data.records import DatasetInfo
 from sb3_dce.data.transitions import Transitions
 from sb3_dce.errors import ConfigError, DatasetError, DatasetSemanticsError, DatasetWarning
@@ -472,6 +472,18 @@ _RULES = (
         lambda data: "the actions fill more than the inner half of their bounds",
         "Give the true bounds with action_low and action_high, so that they are scaled to [-1, 1]",
     ),
+    _Rule(
+        "action type",
+        r"actions are stored as",
+        lambda data: "floating point numbers",
+        "If they are numbers of choices, these agents cannot learn from them",
+    ),
+    _Rule(
+        "reward scale",
+        r"rewards reach",
+        lambda data: f"none beyond {HUGE_REWARD:g}",
+        "Set reward_scale; sb3-dce datasets report recommends one",
+    ),
     _Rule("observation type", r"are integers", lambda data: "floating point numbers", "Store float32"),
     _Rule(
         "constant observations",
@@ -495,7 +507,7 @@ _RULES = (
     ),
     _Rule(
         "flags",
-        r"rows? ends? an episode|terminal and timeout at once",
+        r"rows? ends? an episode|terminal and timeout at once|no row is marked as the end",
         lambda data: f"{data.info.n_terminals / data.info.file_rows:.2%} of the rows are terminal, none is a timeout as well",
         "terminals are 1 where the task truly ended, timeouts where a time limit did",
     ),

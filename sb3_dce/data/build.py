@@ -15,10 +15,20 @@ import numpy as np
 
 from sb3_dce.data.catalog import DatasetSpec
 from sb3_dce.data.columns import ColumnSummary, copy_columns
-from sb3_dce.data.episodes import Episodes, d4rl_rows, fill_next_observations, find_episodes, usable_rows
-from sb3_dce.data.layout import WIDE_BLOCK_ROWS, ArraySource, RowLayout, check_layout, read_flags, row_blocks
+from sb3_dce.data.episodes import Episodes, d4rl_rows, ends_of_ids, fill_next_observations, find_episodes, usable_rows
+from sb3_dce.data.layout import (
+    EPISODES,
+    INCOMPLETE,
+    WIDE_BLOCK_ROWS,
+    ArraySource,
+    RowLayout,
+    check_layout,
+    read_flags,
+    row_blocks,
+)
 from sb3_dce.data.memory import require_memory
 from sb3_dce.data.quality import (
+    HUGE_REWARD,
     Findings,
     check_actions,
     check_duplicates,
@@ -79,8 +89,14 @@ def build_rows(
     uses_next = has_next and not options.d4rl_compat
     findings = Findings()
 
-    terminals = read_flags(sources["terminals"], "terminals", where)
+    n_rows = sources["observations"].shape[0]
+    terminals = (
+        read_flags(sources["terminals"], "terminals", where) if "terminals" in sources else np.zeros(n_rows, dtype=bool)
+    )
     timeouts = read_flags(sources["timeouts"], "timeouts", where) if "timeouts" in sources else None
+    if EPISODES in sources:
+        ends = ends_of_ids(np.asarray(sources[EPISODES][slice(None)]).reshape(-1), where) & ~terminals
+        timeouts = ends if timeouts is None else timeouts | ends
     check_flags(terminals, timeouts, findings)
     limit = options.max_episode_steps or (spec.max_episode_steps if spec else None)
     if options.d4rl_compat and timeouts is None and limit is None:
@@ -91,7 +107,7 @@ def build_rows(
             key="timeouts",
         )
 
-    rows = _allocate(len(terminals), layout.width, where)
+    rows = _allocate(n_rows, layout.width, where)
     rows[:, layout.terminals] = terminals[:, None]
     keys = ("observations", "actions", "rewards", *(["next_observations"] if uses_next else []))
     summaries = {key: copy_columns(sources[key], rows[:, getattr(layout, key)], key, where) for key in keys}
@@ -118,6 +134,8 @@ def build_rows(
     actions = check_actions(rows[:, layout.actions], summaries["actions"], options, findings, where)
     rewards = _reward_facts(rows[:, layout.rewards.start], episodes, used)
     whole = _whole_episodes(episodes, rewards.returns, bad)
+    if INCOMPLETE in sources:
+        whole[episodes.index[read_flags(sources[INCOMPLETE], INCOMPLETE, where)]] = False
     if "-cloned-" not in dataset_id:  # D4RL fills these up with copies of the demonstrations
         check_duplicates(rows, findings)
 
@@ -210,7 +228,14 @@ def _check_content(
     findings: Findings,
 ) -> None:
     check_observations(summaries["observations"], sources["observations"].dtype.kind in "iu", findings)
+    if (kind := sources["actions"].dtype).kind in "iub":
+        findings.warnings.append(
+            f"actions are stored as {kind}: numbers of discrete actions? The agents act continuously, there is none for those"
+        )
     reward = summaries["rewards"]
+    largest = max(abs(reward.low[0]), abs(reward.high[0]))
+    if largest > HUGE_REWARD:
+        findings.warnings.append(f"rewards reach {largest:.3g}: critics learn such values slowly, set reward_scale")
     if reward.low[0] == reward.high[0]:
         findings.warnings.append(f"the reward is constant, {reward.low[0]:g}: there is nothing to learn from")
 

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sb3_dce.data.layout import BLOCK_ROWS, RowLayout, row_blocks
+from sb3_dce.data.layout import BLOCK_ROWS, EPISODES, RowLayout, row_blocks
+from sb3_dce.errors import DatasetSemanticsError
 
 # D4RL's replay sets have unmarked ends; beyond this share the rows are no sequence of episodes any more.
 MAX_JUMP_SHARE = 0.05
@@ -93,6 +94,34 @@ def find_episodes(
     index = np.zeros(len(ends), dtype=np.int32)
     np.cumsum(ends[:-1], out=index[1:])
     return Episodes(ends, limits, index, starts, np.diff(starts, append=len(ends)), rule)
+
+
+def ends_of_ids(ids: np.ndarray, where: str) -> np.ndarray:
+    """
+    Last rows of episodes that are told apart by an id.
+
+    :param ids: numbers, shape (rows,)
+    :param where: file, for messages
+    :return: True on the last row of each id, shape (rows,)
+    :raises DatasetSemanticsError: if an id is missing (NaN), or comes again after another one
+    """
+    if ids.dtype.kind == "f" and not np.isfinite(ids).all():
+        row = int(np.flatnonzero(~np.isfinite(ids))[0])
+        hint = "Give every row the id of its episode"
+        raise DatasetSemanticsError(f"row {row} has no episode id", where=where, hint=hint, key=EPISODES, index=row)
+    ends = np.append(ids[1:] != ids[:-1], True)
+    firsts = np.append(0, np.flatnonzero(ends)[:-1] + 1)
+    _, once = np.unique(ids[firsts], return_index=True)
+    if len(once) < len(firsts):
+        row = int(np.setdiff1d(firsts, firsts[once])[0])
+        raise DatasetSemanticsError(
+            f"the episode id {ids[row]:g} begins again in row {row}, after rows of other episodes",
+            where=where,
+            hint="Sort the rows by episode and time",
+            key=EPISODES,
+            index=row,
+        )
+    return ends
 
 
 def rows_at_limit(terminals: np.ndarray, horizon: int, count_after_terminal: int = 0) -> np.ndarray:

@@ -17,6 +17,8 @@ from sb3_dce.errors import DatasetFormatError, DatasetSecurityError, DatasetSema
 
 REQUIRED_KEYS = ("observations", "actions", "rewards", "terminals")
 CORE_KEYS = (*REQUIRED_KEYS, "timeouts", "next_observations")
+# An id per row, whose changes end episodes; and rows of episodes that are not there as a whole, whose returns mean nothing.
+EPISODES, INCOMPLETE = "episodes", "incomplete"
 MATRIX_KEYS = ("observations", "actions", "next_observations")
 # Rows handled at once: 16k rows of HalfCheetah observations (1.1 MB) stay in the second-level cache.
 BLOCK_ROWS = 16_384
@@ -198,7 +200,7 @@ def block_rows_of(source: ArraySource) -> int:
 
 def _check_keys(sources: Mapping[str, ArraySource], where: str, found: list[str]) -> None:
     missing = [key for key in REQUIRED_KEYS if key not in sources]
-    if not missing:
+    if not missing or (missing == ["terminals"] and EPISODES in sources):
         return
     near = [f"{name} (for {key})" for key in missing for name in _NEAR_MISSES[key] if name in found]
     hint = f"Rename {', '.join(near)}" if near else "Rename or add them"

@@ -8,7 +8,7 @@ from os import PathLike
 from typing import Any
 
 from sb3_dce.data.hash_record import as_sha256, verify_hash, verify_record
-from sb3_dce.data.layout import CORE_KEYS
+from sb3_dce.data.layout import CORE_KEYS, EPISODES, REQUIRED_KEYS
 from sb3_dce.data.locate import find_file
 from sb3_dce.data.minari import folder_of, is_minari_name
 from sb3_dce.data.transitions import Transitions
@@ -74,13 +74,15 @@ def load_dataset(source: Any, **options: Any) -> Transitions:
             )
         return source
     if isinstance(source, Mapping):
-        unknown = sorted(set(source) - set(CORE_KEYS))
-        missing = sorted({"observations", "actions", "rewards", "terminals"} - set(source))
+        known = (*CORE_KEYS, EPISODES)
+        unknown = sorted(set(source) - set(known))
+        needed = set(REQUIRED_KEYS) - ({"terminals"} if EPISODES in source else set())
+        missing = sorted(needed - set(source))
         if unknown or missing:
             raise ConfigError(
-                f"a dictionary of arrays has the keys {', '.join(CORE_KEYS)}; missing {missing}, unknown {unknown}",
+                f"a dictionary of arrays has the keys {', '.join(known)}; missing {missing}, unknown {unknown}",
                 key=str((missing + unknown)[0]),
-                hint="Rename its keys; timeouts and next_observations may be left out.",
+                hint="Rename its keys; timeouts, next_observations and episodes (an id per row) may be left out.",
             )
         return Transitions.from_arrays(**source, **options)
     if type(source).__module__.partition(".")[0] == "pandas":

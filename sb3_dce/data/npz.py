@@ -24,7 +24,7 @@ from numpy.lib import format as npy
 
 from sb3_dce.data.file_checks import translated_errors
 from sb3_dce.data.hdf5 import DEFAULT_MAX_BYTES, MAX_OBJECTS, MAX_RATIO, RATIO_APPLIES_ABOVE
-from sb3_dce.data.layout import CORE_KEYS
+from sb3_dce.data.layout import CORE_KEYS, INCOMPLETE
 from sb3_dce.data.locate import require_file
 from sb3_dce.data.memory import require_memory
 from sb3_dce.errors import DatasetError, DatasetFormatError, DatasetIntegrityError, DatasetSecurityError
@@ -162,7 +162,7 @@ def _select(infos: Iterable[zipfile.ZipInfo], path: Path, max_bytes: int) -> dic
         elif twice:
             what = f"member {twice[0][:60]!r} is there more than once"
         raise DatasetSecurityError(what, where=str(path), hint="Write the arrays again with numpy.savez", path=path)
-    members = {name: info for name, info in zip(names, infos, strict=True) if name in CORE_KEYS}
+    members = {name: info for name, info in zip(names, infos, strict=True) if name in (*CORE_KEYS, INCOMPLETE)}
     total = sum(info.file_size for info in members.values())
     if total > max_bytes:
         raise DatasetSecurityError(

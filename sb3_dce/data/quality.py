@@ -20,6 +20,7 @@ from sb3_dce.errors import DatasetSemanticsError
 
 # Beyond these a loss becomes NaN, a scale is probably wrong, or data were probably joined twice.
 HUGE_VALUE = 1e6
+HUGE_REWARD = 1e5
 MAX_EXCESS = 0.01
 MAX_DUPLICATES = 0.05
 
@@ -243,6 +244,11 @@ def check_episodes(episodes: Episodes, n_dropped: int, has_timeouts: bool, limit
     n_episodes = len(episodes.starts) - episodes.open_last
     if not has_timeouts:
         findings.notes.append(f"no timeouts key; episode ends: {episodes.rule}; {n_episodes} episodes")
+    if not has_timeouts and limit is None and len(episodes.starts) == 1 and episodes.open_last:
+        findings.warnings.append(
+            f"no row is marked as the end of an episode, so all {len(episodes.ends):,} rows count as one: give timeouts, or "
+            "episodes with an id per row"
+        )
     if episodes.open_last:
         findings.notes.append(f"the last episode is open: {n_dropped} rows dropped")
     longest = int(episodes.lengths.max())

@@ -11,6 +11,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from sb3_dce.data.layout import INCOMPLETE
 from sb3_dce.data.locate import require_file
 from sb3_dce.errors import ConfigError, DatasetFormatError, DatasetIntegrityError, DatasetSecurityError, DatasetWarning
 
@@ -21,7 +22,8 @@ def arrays_from_replay_buffer(buffer: Any) -> dict[str, np.ndarray]:
     """
     Arrays of a filled buffer: oldest row first, one environment after the other, actions in the units of the environment.
 
-    A buffer that has begun to overwrite its oldest rows starts in the middle of an episode; that rest counts as one.
+    What is left of an episode whose beginning was overwritten, or that had not ended yet, is marked as incomplete: its rows
+    are used, its return is not known.
 
     :param buffer: ``ReplayBuffer`` of Stable-Baselines3 or ``OfflineReplayBuffer`` of this package, with actions scaled to
         [-1, 1] as all off-policy algorithms store them. With ``optimize_memory_usage=True`` it has no next observations, so
@@ -47,14 +49,19 @@ def arrays_from_replay_buffer(buffer: Any) -> dict[str, np.ndarray]:
     terminals = dones & ~timeouts
     # Where the rows of another environment begin, an episode has been cut, which is no true end.
     last = len(order) * np.arange(1, n_envs) - 1
+    incomplete = np.zeros(len(dones), dtype=bool)
     if len(order):
+        incomplete[last] = ~dones[last]
         timeouts[last] |= ~terminals[last]
+        if buffer.full and buffer.pos:  # at position 0 it has just become full
+            incomplete[len(order) * np.arange(n_envs)] = True
     arrays = {
         "observations": per_env(buffer.observations),
         "actions": _unscaled(per_env(buffer.actions), low, high),
         "rewards": per_env(buffer.rewards),
         "terminals": terminals,
         "timeouts": timeouts,
+        INCOMPLETE: incomplete,
     }
     return arrays | ({"next_observations": per_env(buffer.next_observations)} if has_next else {})
 
@@ -106,7 +113,10 @@ def _bounds(buffer: Any) -> tuple[np.ndarray, np.ndarray]:
     space = buffer.action_space
     if not (hasattr(space, "low") and np.isfinite(space.low).all() and np.isfinite(space.high).all()):
         what = f"the actions are {space}, wanted is a Box with finite bounds"
-        raise DatasetFormatError(what, hint="Call Transitions.from_arrays with the arrays", key="actions")
+        hint = "Bound them, and give the arrays to load_dataset"
+        if not hasattr(space, "low"):
+            hint = "There is no agent for such actions in this package"
+        raise DatasetFormatError(what, hint=hint, key="actions")
     return np.ravel(space.low), np.ravel(space.high)
 
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from sb3_dce.data.file_checks import translated_errors
 from sb3_dce.data.hdf5 import DEFAULT_MAX_BYTES
-from sb3_dce.data.layout import CORE_KEYS, MATRIX_KEYS, REQUIRED_KEYS
+from sb3_dce.data.layout import EPISODES, MATRIX_KEYS, REQUIRED_KEYS
 from sb3_dce.data.locate import require_file
 from sb3_dce.data.memory import require_memory
 from sb3_dce.data.plain_csv import numbers_of, read_plain, without_word
@@ -47,9 +47,14 @@ NAMES = {
     "terminals": ("terminal", "terminals", "terminated"),
     "timeouts": ("timeout", "timeouts", "truncated"),
     "next_observations": ("next_obs", "next_observation", "next_observations"),
+    EPISODES: ("episode", "episodes", "episode_id"),
 }
+KEYS = tuple(NAMES)
 AMBIGUOUS_NAMES = ("done", "dones")
-_WANTED = "Columns are called obs_0, obs_1, ..., action_0, ..., reward, terminal, and optionally timeout and next_obs_0, ..."
+_WANTED = (
+    "Columns are called obs_0, obs_1, ..., action_0, ..., reward, terminal, and optionally timeout, episode (an id) and "
+    "next_obs_0, ..."
+)
 _KEY_OF_NAME = {name: key for key, names in NAMES.items() for name in names}
 _BYTES_PER_CELL = 8
 _MAX_LINE = 2**24
@@ -145,9 +150,9 @@ def _find_columns(names: Sequence[Any], columns: Columns | None, where: str) -> 
             f"column {twice[0]!r} is there {names.count(twice[0])} times", where=where, hint="Rename one", key=str(twice[0])
         )
     found = _by_name(names, where) | _by_mapping(names, columns or {}, where)
-    missing = [key for key in REQUIRED_KEYS if key not in found]
+    missing = [key for key in REQUIRED_KEYS if key not in found and not (key == "terminals" and EPISODES in found)]
     if not missing:
-        return {key: found[key] for key in CORE_KEYS if key in found}
+        return {key: found[key] for key in KEYS if key in found}
     hint = f"{_WANTED}; others are named with columns={{{missing[0]!r}: ...}}"
     ambiguous = [name for name in AMBIGUOUS_NAMES if name in names]
     if "terminals" in missing and ambiguous:
@@ -198,10 +203,10 @@ def _by_mapping(names: Sequence[Any], columns: Columns, where: str) -> dict[str,
     found = {}
     for key, given in columns.items():
         chosen = [given] if isinstance(given, str) or not isinstance(given, Iterable) else list(given)
-        if key not in CORE_KEYS or not chosen or (len(chosen) > 1 and key not in MATRIX_KEYS):
+        if key not in KEYS or not chosen or (len(chosen) > 1 and key not in MATRIX_KEYS):
             raise ConfigError(
                 f"columns={{{key!r}: {given!r}}} is not possible",
-                hint=f"Keys are {', '.join(CORE_KEYS)}; {', '.join(MATRIX_KEYS)} may have several columns, the others one",
+                hint=f"Keys are {', '.join(KEYS)}; {', '.join(MATRIX_KEYS)} may have several columns, the others one",
                 key=key,
             )
         absent = [name for name in chosen if name not in names]
@@ -248,17 +253,27 @@ def _numbers(column: pd.Series[Any], key: str, where: str) -> np.ndarray:
             index=row,
             count=int(missing.sum()),
         )
+    if key == EPISODES:
+        return numbered(np.asarray(column))
     if kind not in "fiub":
         first = column.iloc[0] if len(column) else None
         if isinstance(first, (list, tuple, np.ndarray)):
             what, hint = f"holds a {type(first).__name__} in each row", "Use one column per dimension: obs_0, obs_1, ..."
         else:
-            what, hint = f"has type {column.dtype}, the first value is {first!r}", "Convert it to numbers with astype(float)"
+            what, hint = f"has type {column.dtype}, the first value is {first!r}", "Convert it to numbers"
         raise DatasetFormatError(what, where=where, hint=hint, key=key)
     if missing.any():
         return column.to_numpy(dtype=np.float64, na_value=np.nan)
     dtype = column.dtype
     return column.to_numpy(dtype=dtype if isinstance(dtype, np.dtype) else getattr(dtype, "numpy_dtype", np.float64))
+
+
+def numbered(ids: np.ndarray) -> np.ndarray:
+    """
+    :param ids: of episodes, numbers or anything that can be compared, shape (n,)
+    :return: a number for each, shape (n,)
+    """
+    return ids if ids.dtype.kind in "fiub" else np.unique(ids.astype(str), return_inverse=True)[1]
 
 
 # -- CSV -----------------------------------------------------------------------------------------------------------
@@ -349,7 +364,8 @@ def _by_record(
     """Numbers of the wanted cells, shape (rows, cells), read one record after the other."""
     flags = [n for n, (key, _) in enumerate(cells_of_keys) if key in FLAG_KEYS]
     pick = itemgetter(*(i for _, i in cells_of_keys))
-    values = array("d")
+    values, ids = array("d"), [n for n, (key, _) in enumerate(cells_of_keys) if key == EPISODES]
+    known: dict[str, str] = {}
     for record in rows:
         if len(record) != len(names):
             raise _Line(path, records.line).fault(
@@ -361,6 +377,9 @@ def _by_record(
             cells = [cell if cell.strip() or n in flags else "nan" for n, cell in enumerate(cells)]
         for n in flags:
             cells[n] = without_word(cells[n])
+        for n in ids:
+            if cells[n].strip():
+                cells[n] = known.setdefault(cells[n].strip(), str(len(known)))
         numbers = numbers_of(cells)
         if numbers is None or any(numbers[n] not in (0.0, 1.0) for n in flags):
             raise _bad_cell(record, names, cells_of_keys, _Line(path, records.line))
@@ -392,6 +411,8 @@ def _bad_cell(
 
 
 def _is_good(cell: str, key: str) -> bool:
+    if key == EPISODES:
+        return bool(cell.strip())
     if key not in FLAG_KEYS:
         return numbers_of([cell]) is not None
     return numbers_of([without_word(cell)]) in ([0.0], [1.0])

@@ -16,14 +16,14 @@ from sb3_dce.data.catalog import DatasetSpec, normalized_score
 from sb3_dce.data.hash_record import verify_hash
 from sb3_dce.data.hashes import content_hash, file_sha256
 from sb3_dce.data.hdf5 import D4RLFile, write_hdf5
-from sb3_dce.data.layout import CORE_KEYS, ArraySource, RowLayout
+from sb3_dce.data.layout import CORE_KEYS, EPISODES, INCOMPLETE, ArraySource, RowLayout
 from sb3_dce.data.minari import METADATA_FILE, Flatten, action_bounds, find_minari, reward_note
 from sb3_dce.data.minari_episodes import open_episodes
 from sb3_dce.data.npz import arrays_from_npz, npz_keys, text_from_npz, write_npz
 from sb3_dce.data.records import BOUNDS_ATTRIBUTE, DatasetInfo, ReadOptions, bounds_attribute
 from sb3_dce.data.row_cache import cached_rows
 from sb3_dce.data.sb3_buffer import arrays_from_replay_buffer, load_saved_buffer
-from sb3_dce.data.tables import Columns, arrays_from_csv, arrays_from_dataframe, arrays_from_parquet
+from sb3_dce.data.tables import Columns, arrays_from_csv, arrays_from_dataframe, arrays_from_parquet, numbered
 from sb3_dce.errors import DatasetError, DatasetSemanticsError, DatasetWarning
 
 if TYPE_CHECKING:
@@ -103,10 +103,11 @@ class Transitions:
         observations: Any,
         actions: Any,
         rewards: Any,
-        terminals: Any,
+        terminals: Any = None,
         timeouts: Any = None,
         next_observations: Any = None,
         *,
+        episodes: Any = None,
         spec: DatasetSpec | None = None,
         **options: Any,
     ) -> Transitions:
@@ -116,10 +117,12 @@ class Transitions:
         :param observations: shape (n, obs_dim), or (n,) for one entry
         :param actions: shape (n, act_dim), or (n,) for one entry
         :param rewards: shape (n,)
-        :param terminals: 1 at true ends of the task, shape (n,)
+        :param terminals: 1 at true ends of the task, shape (n,); with ``episodes`` they may be left out if there are none
         :param timeouts: 1 at time limits, shape (n,); without it see ``max_episode_steps``
         :param next_observations: shape of ``observations``; without it the last row of an episode that ends without a
             terminal cannot be used
+        :param episodes: id of the episode of each row, numbers or texts, shape (n,). Where it changes an episode ends, by a
+            timeout unless ``terminals`` says otherwise; the last row ends one, too
         :param spec: entry of the catalogue: expected widths and time limit
         :param options: fields of :class:`~sb3_dce.data.records.ReadOptions`
         :return: the dataset
@@ -127,6 +130,8 @@ class Transitions:
         """
         given = zip(CORE_KEYS, (observations, actions, rewards, terminals, timeouts, next_observations), strict=True)
         sources = {key: np.asarray(array) for key, array in given if array is not None}
+        if episodes is not None:
+            sources[EPISODES] = numbered(np.asarray(episodes))
         dataset_id = spec.id if spec else "arrays"
         return cls._build(sources, dataset_id, None, sources, spec, ReadOptions.of(options))
 
@@ -237,10 +242,11 @@ class Transitions:
         """
         if isinstance(buffer, str | PathLike):
             buffer = load_saved_buffer(buffer, trust)
-        arrays: dict[str, Any] = arrays_from_replay_buffer(buffer)
-        space = buffer.action_space
+        arrays, space = arrays_from_replay_buffer(buffer), buffer.action_space
         bounds = {"action_low": np.ravel(space.low), "action_high": np.ravel(space.high)}
-        return cls.from_arrays(**arrays, **{**bounds, **options})
+        spec = options.pop("spec", None)
+        dataset_id = spec.id if spec else "arrays"
+        return cls._build(arrays, dataset_id, None, CORE_KEYS, spec, ReadOptions.of({**bounds, **options}))
 
     @classmethod
     def from_minari(cls, name: str | PathLike[str], *, flatten: Flatten = False, **options: Any) -> Transitions:
@@ -384,7 +390,10 @@ class Transitions:
     def _exported(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Arrays in D4RL's layout, and attributes. ``generated`` keeps a copy from passing for an official file."""
         arrays = {key: getattr(self, key) for key in CORE_KEYS} | {"terminals": self.terminals.astype(bool)}
-        info = self.info
+        info, last = self.info, self.episodes[-1]
+        incomplete = ~np.isin(self.episodes, info.episode_numbers)
+        if (incomplete & ~((self.episodes == last) & info.open_last_episode)).any():
+            arrays[INCOMPLETE] = incomplete
         attributes = {"dataset_id": info.id, "generated": True, "content_hash": content_hash(arrays)}
         return arrays, {**attributes, **bounds_attribute(info.action_space_low, info.action_space_high)}
 
@@ -443,7 +452,7 @@ def _rows_of_hdf5(path: Path, spec: DatasetSpec | None, options: ReadOptions) ->
                 hint="Give it its own name, such ids end in -sb3",
             )
         options = options.with_bounds_of(file.attributes().get(BOUNDS_ATTRIBUTE), str(path))
-        dataset_id, sources = spec.id if spec else path.stem, file.select(CORE_KEYS)
+        dataset_id, sources = spec.id if spec else path.stem, file.select((*CORE_KEYS, INCOMPLETE))
         return build_rows(sources, dataset_id=dataset_id, path=path, found_keys=file.keys, spec=spec, options=options)
 
 

@@ -1,0 +1,197 @@
+"""Ends of episodes that come as ids, and episodes that are not there as a whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pandas as pd
+import pytest
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_dce import OfflineBC, OfflineDCE, load_dataset
+from sb3_dce.data.advice import examine
+from sb3_dce.data.selection import rows_of_best_episodes
+from sb3_dce.envs import SpacesEnv
+from sb3_dce.errors import DatasetError, DatasetFormatError, DatasetSemanticsError, DatasetWarning
+
+IDS = np.repeat(["B-12", "A-3", "B-1"], [5, 4, 6])
+
+
+def steps(n: int = 15) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return {
+        "observations": rng.standard_normal((n, 2)),
+        "actions": rng.uniform(-1, 1, (n, 1)),
+        "rewards": np.arange(n, dtype=float),
+    }
+
+
+def frame(**more: Any) -> pd.DataFrame:
+    data = steps()
+    columns = {"obs_0": data["observations"][:, 0], "obs_1": data["observations"][:, 1], "action": data["actions"][:, 0]}
+    return pd.DataFrame({**columns, "reward": data["rewards"], **more})
+
+
+# -- ids ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ids", [IDS, np.repeat([7, 3, 9], [5, 4, 6]), np.repeat([0.5, 0.0, 2.0], [5, 4, 6])], ids=str)
+def test_an_id_per_row_marks_the_ends_of_episodes(ids: np.ndarray) -> None:
+    data = load_dataset({**steps(), "episodes": ids})
+    assert data.info.episode_lengths.tolist() == [5, 4, 6] and data.info.n_terminals == 0
+    assert data.info.episode_returns.tolist() == [10.0, 26.0, 69.0]
+    assert len(data) == 12  # the last step of each has no next observation
+    assert np.array_equal(data.next_observations[3], np.float32(steps()["observations"][4]))
+
+
+@pytest.mark.parametrize("source", ["frame", "csv", "csv with quotes", "parquet", "named"])
+def test_tables_have_a_column_for_it(source: str, tmp_path: Path) -> None:
+    table, columns = frame(**{"batch" if source == "named" else "episode_id": IDS}), None
+    where: Any = table
+    if source.startswith("csv"):
+        where = tmp_path / "log.csv"
+        table.to_csv(where, index=False, quoting=1 if source.endswith("quotes") else 0)
+    elif source == "parquet":
+        pytest.importorskip("pyarrow")
+        where = tmp_path / "log.parquet"
+        table.to_parquet(where)
+    elif source == "named":
+        columns = {"episodes": "batch"}
+    data = load_dataset(where, **({"columns": columns} if columns else {}))
+    assert data.info.episode_lengths.tolist() == [5, 4, 6]
+
+
+def test_true_ends_and_ids_go_together() -> None:
+    terminals = np.zeros(15, dtype=bool)
+    terminals[8] = True
+    data = load_dataset({**steps(), "terminals": terminals, "episodes": IDS})
+    assert (data.info.n_terminals, data.info.n_timeouts) == (1, 2) and len(data) == 13
+
+
+@pytest.mark.parametrize(
+    ("ids", "message"),
+    [
+        (np.repeat([1, 2, 1], 5), "episode id 1 begins again in row 10.*Sort the rows"),
+        (np.r_[np.nan, np.ones(14)], "row 0 has no episode id"),
+    ],
+)
+def test_ids_that_cannot_be_right_are_refused(ids: np.ndarray, message: str) -> None:
+    with pytest.raises(DatasetSemanticsError, match=message):
+        load_dataset({**steps(), "episodes": ids})
+
+
+def test_an_empty_id_in_a_file_is_named_with_its_line(tmp_path: Path) -> None:
+    table = frame(episode=IDS.astype(object))
+    table.loc[6, "episode"] = None
+    table.to_csv(tmp_path / "log.csv", index=False)
+    with pytest.raises(DatasetFormatError, match="line 8, column 'episode': empty cell"):
+        load_dataset(tmp_path / "log.csv")
+    with pytest.raises(DatasetSemanticsError, match="no value"):
+        load_dataset(table)
+
+
+def test_rows_without_any_mark_are_said_to_be_one_episode(tmp_path: Path) -> None:
+    with pytest.warns(DatasetWarning, match="all 15 rows count as one: give timeouts, or episodes"):
+        load_dataset({**steps(), "terminals": np.zeros(15)})
+    frame(terminal=0).to_csv(tmp_path / "log.csv", index=False)
+    found = {check.name: check.verdict for check in examine(tmp_path / "log.csv").checks}
+    assert found["flags"] == "warning" and "other" not in found
+
+
+# -- incomplete episodes -----------------------------------------------------------------------------------------------
+
+
+def collected(make_env: Callable[[], gym.Env], n_steps: int, n_envs: int = 3, size: int = 10_000) -> Any:
+    env = DummyVecEnv([make_env] * n_envs)
+    model = SAC("MlpPolicy", env, learning_starts=10**6, buffer_size=size, policy_kwargs={"net_arch": [4]}, seed=0)
+    return model.learn(n_steps * n_envs).replay_buffer
+
+
+class Endless(gym.Wrapper[Any, Any, Any, Any]):
+    """Episodes of exactly ten steps."""
+
+    def step(self, action: Any) -> Any:
+        obs, reward, _, _, info = self.env.step(action)
+        self.count += 1
+        return obs, reward, False, self.count == 10, info
+
+    def reset(self, **kwargs: Any) -> Any:
+        self.count = 0
+        return self.env.reset(**kwargs)
+
+
+@pytest.fixture
+def ten_steps(make_point_mass: Callable[[], gym.Env]) -> Callable[[], gym.Env]:
+    return lambda: Endless(make_point_mass())
+
+
+def test_cut_episodes_of_a_buffer_have_no_return(ten_steps: Callable[[], gym.Env], tmp_path: Path) -> None:
+    data = load_dataset(collected(ten_steps, 24))
+    assert len(data) == 72 and data.info.episode_lengths.tolist() == [10] * 6
+    assert set(np.bincount(data.episodes[rows_of_best_episodes(data, 0.3)])) == {0, 10}
+    for save, name in ((data.to_hdf5, "data.hdf5"), (data.to_npz, "data.npz")):
+        save(tmp_path / name)
+        again = load_dataset(tmp_path / name)
+        assert np.array_equal(again.rows, data.rows) and np.array_equal(again.info.episode_returns, data.info.episode_returns)
+
+
+def test_what_a_full_buffer_has_overwritten_makes_an_episode_incomplete(ten_steps: Callable[[], gym.Env]) -> None:
+    data = load_dataset(collected(ten_steps, 36, n_envs=2, size=2 * 24))
+    assert len(data) == 48 and data.info.episode_lengths.tolist() == [10] * 2  # of 8 + 10 + 6 rows each
+
+
+def test_episodes_that_ended_are_whole_up_to_the_last(ten_steps: Callable[[], gym.Env], tmp_path: Path) -> None:
+    data = load_dataset(collected(ten_steps, 20))
+    assert data.info.episode_lengths.tolist() == [10] * 6 and not data.info.open_last_episode
+    data.to_npz(tmp_path / "data.npz")
+    assert "incomplete" not in np.load(tmp_path / "data.npz").files
+
+
+def test_an_episode_that_lost_rows_stays_incomplete_in_a_copy(tmp_path: Path) -> None:
+    data = {**steps(), "episodes": IDS}
+    data["observations"][7] = np.nan
+    with_gap = load_dataset(data, drop_nonfinite=True)
+    assert with_gap.info.episode_lengths.tolist() == [5, 6]
+    with_gap.to_hdf5(tmp_path / "data.hdf5")
+    assert load_dataset(tmp_path / "data.hdf5").info.episodes == 2
+
+
+# -- actions that are no actions of the environment --------------------------------------------------------------------
+
+
+def test_numbers_of_discrete_actions_are_pointed_at(tmp_path: Path) -> None:
+    data = {**steps(), "actions": np.random.default_rng(0).integers(0, 2, 15), "episodes": IDS}
+    with pytest.warns(DatasetWarning, match=r"actions are stored as int64: numbers of discrete actions\?"):
+        load_dataset(data)
+    with pytest.raises(DatasetError, match="There is no agent for such actions"):
+        load_dataset(_BufferOf(spaces.Discrete(2)))
+
+
+class _BufferOf:
+    """What a replay buffer of DQN looks like from outside."""
+
+    buffer_size, pos, full, n_envs = 4, 4, True, 1
+    observations = actions = rewards = dones = timeouts = np.zeros((4, 1))
+
+    def __init__(self, space: spaces.Space[Any]) -> None:
+        self.action_space = space
+
+
+def test_scaled_actions_in_an_environment_with_other_bounds_are_pointed_at() -> None:
+    env = SpacesEnv(spaces.Box(-np.inf, np.inf, (2,)), spaces.Box(-2.0, 2.0, (1,)))
+    model = OfflineBC("MlpPolicy", env, load_dataset({**steps(), "episodes": IDS}), batch_size=4)
+    with pytest.warns(DatasetWarning, match=r"environment has actions from -2 to 2, the data were read .* from -1 to 1"):
+        model.learn(1)
+    stated = load_dataset({**steps(), "episodes": IDS}, action_scale=2.0)
+    OfflineDCE("MlpPolicy", env, stated, batch_size=4, policy_kwargs={"net_arch": [4]}).learn(1)
+
+
+def test_huge_rewards_are_pointed_at() -> None:
+    with pytest.warns(DatasetWarning, match=r"rewards reach 1.4e\+07: .*reward_scale"):
+        load_dataset({**steps(), "rewards": 1e6 * steps()["rewards"], "episodes": IDS})
