@@ -26,8 +26,8 @@ from sb3_dce.data import Transitions, find_file, load_dataset, load_transitions
 from sb3_dce.data.catalog import DatasetSpec, resolve
 from sb3_dce.data.locate import is_path
 from sb3_dce.data.minari import is_minari_name
-from sb3_dce.envs import SpacesEnv, dataset_spaces, make_env_if_possible, make_minari_env
-from sb3_dce.errors import ConfigError, DatasetIntegrityError, DatasetSemanticsError, DatasetWarning
+from sb3_dce.envs import SpacesEnv, dataset_spaces, make_env_if_possible, own_env
+from sb3_dce.errors import ConfigError, DatasetIntegrityError, DatasetSemanticsError, DatasetWarning, SB3DCEWarning
 from sb3_dce.networks import StandardizedExtractor
 from sb3_dce.normalizing import FEWEST_OBSERVATIONS, is_untouched, vec_normalize_of
 
@@ -76,18 +76,18 @@ class AttachingMixin(OffPolicyAlgorithm):
         if "dataset" in overrides:
             hint = "Give it once, as the first argument; other data of a model: model.set_dataset(...)."
             raise ConfigError("two datasets are given", key="dataset", hint=hint)
+        hyperparams.check_keys(cls, overrides, where=f"{cls.__name__}.load_dataset", zoo_keys=False)
         name = as_dataset(name)
         spec = None if isinstance(name, Transitions) else find_file(name)[1]
         row = hyperparams.load_row(_algo_with_rows(cls), None if spec is None else spec.id)
         arguments = {**hyperparams.split_row(row).kwargs, **overrides}
-        hyperparams.check_keys(cls, overrides, where=f"{cls.__name__}.load_dataset", zoo_keys=False)
         hyperparams.check_keys(cls, arguments, where=f"zoo_hyperparams/{cls.algo_name}.yml")
         arguments["dataset"] = name
         arguments["policy"] = policy or arguments.get("policy", "MlpPolicy")
         if env is None and spec is not None:
             env = make_env_if_possible(spec.id)
-        elif env is None and is_minari_name(name):
-            env = make_minari_env(name)
+        elif env is None and not isinstance(name, Transitions):
+            env = own_env(os.fspath(name))
         return cls(env=env, **arguments)  # type: ignore[arg-type]
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
@@ -103,6 +103,14 @@ class AttachingMixin(OffPolicyAlgorithm):
         env = self._wrap_env(env, self.verbose)
         self._take_spaces_of(env)
         super().set_env(env, force_reset)
+        self.warn_without_statistics()
+
+    def warn_without_statistics(self) -> None:
+        """Say it where ``predict`` would see other observations than in training; training and our evaluation refuse."""
+        try:
+            vec_normalize_of(self)
+        except ConfigError as error:
+            warnings.warn(str(error), SB3DCEWarning)
 
     def _take_spaces_of(self, env: VecEnv) -> None:
         for name, what in (("observation_space", "observations"), ("action_space", "actions")):

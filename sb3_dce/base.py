@@ -281,8 +281,9 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         self._stats_window_size = self.stats_window_size
         given, settings = self.policy_kwargs, self.policy_settings()
         check_policy_kwargs(given, self.policy_class, settings)
-        defaults = {name for name, value in given.items() if name == "net_arch" and value is None}
-        self.policy_kwargs = {**settings, **{name: value for name, value in given.items() if name not in defaults}}
+        says_nothing = (("net_arch", None), ("use_sde", False))
+        chosen = {name: value for name, value in given.items() if not any(name == n and value is v for n, v in says_nothing)}
+        self.policy_kwargs = {**settings, **chosen}
         try:
             super()._setup_model()
         finally:

@@ -36,6 +36,21 @@ NOT_FOR_SET = {
 }
 
 
+@app.callback(invoke_without_command=True)
+def options(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Say which version this is.")] = False,
+) -> None:
+    """Offline reinforcement learning for people who know Stable-Baselines3."""
+    if version:
+        import sb3_dce
+
+        console.print(f"sb3_dce {sb3_dce.__version__}")
+        raise typer.Exit
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("runs/demo"),
@@ -53,8 +68,8 @@ def train(
     dataset: DatasetArgument,
     algo: Annotated[str, typer.Option(help="Agent: dce, iql, td3bc, ... (the files in zoo_hyperparams).")] = "dce",
     updates: Annotated[
-        float, typer.Option(min=0, show_default=False, help="Gradient steps, e.g. 1e6; default: the dataset's row.")
-    ] = 0,
+        float | None, typer.Option(min=1, show_default=False, help="Gradient steps, e.g. 1e6; default: the dataset's row.")
+    ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Number of seeds, each a run of its own.")] = 1,
     first_seed: Annotated[int, typer.Option(min=0, max=LAST_SEED, help="The first of them.")] = 0,
     eval_freq: Annotated[int, typer.Option(min=1, help="Gradient steps between two evaluations and checkpoints.")] = 5000,
@@ -74,7 +89,7 @@ def train(
     train_seeds(
         algo=algo,
         dataset=dataset,
-        n_updates=_steps(updates) or None,
+        n_updates=None if updates is None else _steps(updates),
         seeds=range(first_seed, first_seed + seeds),
         eval_freq=eval_freq,
         n_eval_episodes=eval_episodes,
@@ -207,11 +222,14 @@ def evaluate(
     dataset: Annotated[str | None, typer.Option(help="Id that names environment and score; default: the model's own.")] = None,
     episodes: Annotated[int, typer.Option(min=1, help="Episodes.")] = 10,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first episode.")] = 0,
+    env: Annotated[
+        str | None, typer.Option(show_default=False, help="Id of an environment, for models of data that have none.")
+    ] = None,
 ) -> None:
     """Run a trained agent in its environment: returns, lengths, normalised score."""
     from sb3_dce.training import evaluate_file
 
-    outcome = evaluate_file(model, dataset, episodes, seed)
+    outcome = evaluate_file(model, dataset, episodes, seed, env)
     for number, (value, length) in enumerate(zip(outcome.returns, outcome.lengths, strict=True)):
         console.print(f"  episode {number:>3}   return {value:9.1f}   length {length:>5}")
     score = "" if outcome.score is None else f"   normalised score {outcome.score:.1f} ({outcome.dataset_id})"

@@ -26,13 +26,17 @@ from sb3_dce.files import write_text
 from sb3_dce.hyperparams import check_keys, full_name
 from sb3_dce.launch import launch_all
 from sb3_dce.plots import plot_learning_curves
-from sb3_dce.runs import RunSpec, check_before_running, read_divergence, read_result
+from sb3_dce.runs import RunSpec, check_before_running, last_metrics, read_divergence, read_result
 
 BANDS = (
     "Thick: mean over seeds; thin: each seed; bands: 95 % confidence interval of the mean (Student's t) from three seeds on, "
     "the range of two."
 )
 COLUMNS = ("agent", "seed", "n_updates", "mean_return", "normalized_score", "seconds", "seconds_per_1000", "overrides")
+
+
+# What is shown of agents that cannot be evaluated: how far their actions are from the data's, and what they expect.
+DIAGNOSTICS = ("action_dist", "action_sat", "q_data", "q_policy", "gap_td")
 
 
 class Row(NamedTuple):
@@ -46,6 +50,7 @@ class Row(NamedTuple):
     :param std: sample standard deviation over the seeds, NaN for one
     :param seconds_per_1000: mean training seconds of 1000 updates, evaluations included
     :param overrides: what was set instead of the dataset's row
+    :param diagnostics: last logged values by name (:data:`DIAGNOSTICS`), means over the seeds
     """
 
     agent: str
@@ -55,6 +60,7 @@ class Row(NamedTuple):
     std: float
     seconds_per_1000: float
     overrides: dict[str, Any]
+    diagnostics: dict[str, float]
 
 
 def compare(
@@ -189,14 +195,18 @@ def summarize(
     results = {algo: list(found.values()) for algo, found in runs.items()}
     _write_csv(folder / "comparison.csv", results)
     scored = dataset_id is not None
-    rows = [_row(algo, found, scored) for algo, found in results.items()]
+    rows = [_row(algo, found, scored) for algo, found in runs.items()]
     level = data_return
     if level is not None and dataset_id is not None:
         level = float(normalized_score(dataset_id, level))
     table = _cells(rows, level, scored)
     notes = [f"Diverged, and in no mean: {name} ({reason})." for name, reason in lost.items()]
-    if rows and all(np.isnan(row.mean) for row in rows):
-        notes.append("Nothing was evaluated: no environment is known for these data, or its simulator is not installed.")
+    if rows and _unevaluated(rows):
+        notes.append(
+            "Nothing was evaluated: no environment is known for these data, or its simulator is not installed. action_dist is "
+            "the mean distance of the policy's actions from the data's (scaled to [-1, 1]), q_data what the critics expect. "
+            "They say which agents stay near the data and which critics diverge, not which policy is best."
+        )
     _show(table, console)
     for note in notes:
         console.print(note, markup=False)
@@ -211,25 +221,41 @@ def summarize(
     return rows
 
 
-def _row(algo: str, results: list[dict[str, Any]], scored: bool) -> Row:
+def _row(algo: str, runs: dict[Path, dict[str, Any]], scored: bool) -> Row:
+    folders, results = list(runs), list(runs.values())
     values = [r["normalized_score"] if scored else r["mean_return"] for r in results]
     known = np.array([np.nan if value is None else value for value in values], dtype=float)
     std = float(known.std(ddof=1)) if len(known) > 1 else float("nan")
     seconds = float(np.mean([1000 * r["seconds"] / r["n_updates"] for r in results]))
     overrides = results[0]["config"].get("overrides", {})
-    return Row(algo, len(results), results[0]["n_updates"], float(known.mean()), std, seconds, overrides)
+    logged = [last_metrics(folder) for folder in folders]
+    diagnostics = {
+        name: float(np.mean([metrics[name] for metrics in logged]))
+        for name in DIAGNOSTICS
+        if all(name in metrics for metrics in logged)
+    }
+    return Row(algo, len(results), results[0]["n_updates"], float(known.mean()), std, seconds, overrides, diagnostics)
+
+
+def _unevaluated(rows: list[Row]) -> bool:
+    return all(np.isnan(row.mean) for row in rows)
 
 
 def _cells(rows: list[Row], data_level: float | None, scored: bool) -> list[list[str]]:
     """Heading and lines of the table, the best first."""
-    heading = ["agent", "set", "normalised score" if scored else "return"]
-    lines = [[*heading, "± over seeds", "seeds", "updates", "s per 1000 updates"]]
+    heading = ["normalised score" if scored else "return", "± over seeds"]
+    unevaluated = bool(rows) and _unevaluated(rows)
+    if unevaluated:
+        heading = [name for name in DIAGNOSTICS if any(name in row.diagnostics for row in rows)]
+    lines = [["agent", "set", *heading, "seeds", "updates", "s per 1000 updates"]]
     for row in sorted(rows, key=lambda row: -row.mean):
         changed = ", ".join(f"{name}={value}" for name, value in row.overrides.items())
-        mean, spread = ("-" if np.isnan(value) else f"{value:.1f}" for value in (row.mean, row.std))
-        numbers = [mean, spread, str(row.n_seeds), f"{row.n_updates:,}", f"{row.seconds_per_1000:.1f}"]
+        values = ["-" if np.isnan(value) else f"{value:.1f}" for value in (row.mean, row.std)]
+        if unevaluated:
+            values = [f"{row.diagnostics[name]:.3g}" if name in row.diagnostics else "-" for name in heading]
+        numbers = [*values, str(row.n_seeds), f"{row.n_updates:,}", f"{row.seconds_per_1000:.1f}"]
         lines.append([row.agent, changed, *numbers])
-    if data_level is not None:
+    if data_level is not None and not unevaluated:
         lines.append(["mean of the data", "", f"{data_level:.1f}", "", "", "", ""])
     if not any(line[1] for line in lines[1:]):
         lines = [[line[0], *line[2:]] for line in lines]

@@ -11,7 +11,9 @@ from __future__ import annotations
 import contextlib
 import importlib
 import io
+import os
 from collections.abc import Iterator
+from os import PathLike
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -23,7 +25,10 @@ from gymnasium.wrappers.utils import create_zero_array
 
 from sb3_dce.data import catalog
 from sb3_dce.data.catalog import DatasetSpec
-from sb3_dce.data.minari import environment_spec, find_minari
+from sb3_dce.data.file_checks import HDF5_SIGNATURE
+from sb3_dce.data.hdf5 import D4RLFile
+from sb3_dce.data.locate import known_dataset
+from sb3_dce.data.minari import environment_spec, find_minari, is_minari_name
 from sb3_dce.errors import ConfigError
 from sb3_dce.robotics import KITCHEN_ROBOT_NOISE_RATIO, KitchenObservation, fix_adroit, fix_kitchen_joint_types, kitchen_tasks
 
@@ -154,6 +159,18 @@ class MissingSimulator(NamedTuple):
     package: str | None
 
 
+def own_env(name_or_path: str) -> gym.Env | None:
+    """
+    Environment of data outside of the catalogue, as they themselves say.
+
+    :param name_or_path: file, or ``minari:`` and an id of Minari
+    :return: an environment that can be stepped, or ``None``
+    """
+    if is_minari_name(name_or_path):
+        return make_minari_env(name_or_path)
+    return make_recorded_env(name_or_path) if os.path.isfile(name_or_path) else None
+
+
 def make_minari_env(name: str) -> gym.Env | None:
     """
     Environment of a dataset of Minari: the one that Gymnasium itself knows by the id in the metadata. They may also name
@@ -179,6 +196,68 @@ def make_minari_env(name: str) -> gym.Env | None:
         return None
     assert isinstance(env, gym.Env)
     return env
+
+
+def make_env(env_id: str) -> gym.Env:
+    """
+    The environment with this id, or that of the dataset with this id.
+
+    :param env_id: id of Gymnasium, or id or alias of the catalogue
+    :return: environment with its time limit
+    :raises ConfigError: if it is unknown or its simulator is missing
+    """
+    spec = dataset_of_env(env_id)
+    if spec is not None:
+        missing = missing_simulator(spec)
+        if missing is not None:
+            raise ConfigError(missing.reason, where=spec.id, key="env", hint=missing.remedy)
+        return make_env_if_possible(spec.id)
+    if env_id not in gym.registry:
+        # registers its environments, and says at import what it has changed, whatever is asked for
+        with contextlib.suppress(ImportError), contextlib.redirect_stderr(io.StringIO()):
+            importlib.import_module("gymnasium_robotics")
+    try:
+        return gym.make(env_id, disable_env_checker=True)
+    except (gym.error.Error, ImportError, TypeError, ValueError) as error:
+        raise ConfigError(
+            f"cannot make the environment {env_id!r} ({type(error).__name__}: {error})",
+            key="env",
+            hint="Give an id such as HalfCheetah-v4, a dataset id such as pen-human-v0, or module:EnvId.",
+        ) from error
+
+
+def dataset_of_env(env_id: str) -> DatasetSpec | None:
+    """
+    A dataset whose environment this is.
+
+    ``HalfCheetah-v4`` is that of the datasets, and is then made without Gymnasium's and MuJoCo's remarks;
+    ``AdroitHandDoor-v1`` by itself is not, since the datasets' one pays another reward.
+
+    :param env_id: id of Gymnasium, or id or alias of the catalogue
+    :return: entry of the catalogue, ``None`` if there is none
+    """
+    by_env = (spec for spec in catalog.all_specs() if spec.env_id == env_id and spec.family == "gym")
+    return known_dataset(env_id) or next(by_env, None)
+
+
+def make_recorded_env(path: str | PathLike[str]) -> gym.Env | None:
+    """
+    Environment of a file that this package has recorded: the one that Gymnasium itself knows by the id in its attributes.
+
+    :param path: file of a dataset
+    :return: an environment that can be stepped, or ``None``
+    """
+    with open(path, "rb") as opened:
+        if opened.read(len(HDF5_SIGNATURE)) != HDF5_SIGNATURE:
+            return None
+    with D4RLFile(path) as file:
+        env_id = file.attributes().get("env_id")
+    if not isinstance(env_id, str) or ":" in env_id:  # module:EnvId would import, and so run, what the file names
+        return None
+    try:
+        return make_env(env_id)
+    except ConfigError:
+        return None
 
 
 def missing_simulator(spec: DatasetSpec) -> MissingSimulator | None:

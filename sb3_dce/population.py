@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -20,12 +21,14 @@ from torch.utils._pytree import tree_leaves, tree_map
 
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.buffers import OfflineReplayBuffer
+from sb3_dce.checks import check_steps
 from sb3_dce.errors import ConfigError
 from sb3_dce.execution import Engine, choose_execution
 from sb3_dce.networks import StandardizedExtractor
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.optimizers import Learner
 from sb3_dce.precision import matmul_precision
+from sb3_dce.processes import UninterruptedBlock
 from sb3_dce.state import Storage
 
 # Parameters of the base class in which members may differ: they reach the update as numbers, or choose the data.
@@ -118,13 +121,15 @@ class Population:
 
     def train(self, n_updates: int, total_updates: int | None = None) -> None:
         """
-        Train all members.
+        Train all members. When this returns or is interrupted, ``models`` hold what was learned, ready to predict and to be
+        saved.
 
         :param n_updates: updates of each
         :param total_updates: updates of the whole run, over which learning rates may fall, and which decide whether
             compiling pays; default: those completed and these
+        :raises ConfigError: if ``n_updates`` is no whole number from 0 up
         """
-        first = self.models[0]
+        n_updates, first, before = check_steps("n_updates", n_updates), self.models[0], self._n_updates
         total = self._n_updates + n_updates if total_updates is None else total_updates
         for model in self.models:
             model.policy.set_training_mode(True)
@@ -138,17 +143,22 @@ class Population:
         # what each member draws for itself comes from its model, on the processor
         on_device = None if self.own_randomness else self._generator
         source = (first.batch_size, first.precision, tuple(specs.items()))
-        with matmul_precision(first.precision, self.device):
-            for _ in range(n_updates):
-                coef, variant = self._coefficients(total), first.update_variant(self._n_updates)
-                engine.step_drawn(draw, coef, on_device, source, **variant)
-                self._n_updates += 1
-                if first.reads_state_after(self._n_updates):
-                    for index, model in enumerate(self.models):
-                        model._n_updates = self._n_updates
-                        model.read_state(self.state.member(index))
-        for model in self.models:
-            model._n_updates = self._n_updates
+        try:
+            with matmul_precision(first.precision, self.device):
+                for _ in range(n_updates):
+                    variant = first.update_variant(self._n_updates)
+                    with UninterruptedBlock() if engine.has_run(variant) else nullcontext():
+                        engine.step_drawn(draw, self._coefficients(total), on_device, source, **variant)
+                        self._n_updates += 1
+                        if first.reads_state_after(self._n_updates):
+                            for index, model in enumerate(self.models):
+                                model._n_updates = self._n_updates
+                                model.read_state(self.state.member(index))
+        finally:
+            for model in self.models:
+                model._n_updates = self._n_updates
+                model.num_timesteps += self._n_updates - before
+            self.commit()
 
     def _bound_engine(self, planned_updates: int) -> Engine[StackedState]:
         if self._engine is None:
@@ -219,7 +229,7 @@ class Population:
 
     def commit(self) -> list[OfflineAlgorithm]:
         """
-        Write the members' parameters and moments into their models.
+        Write the members' parameters and moments into their models, as :meth:`train` does at its end.
 
         :return: the models, ready to predict and to be saved
         """

@@ -149,9 +149,8 @@ class BatchedRuns:
             while population.n_updates < self.total:
                 self._train_until_due(population, display, task)
                 self._log_metrics(population)
-                models = population.commit()
                 if population.n_updates % self.eval_freq == 0:
-                    self._evaluate(models, population.n_updates)
+                    self._evaluate(population.models, population.n_updates)
                 else:  # the end: the checkpoint that could be evaluated again is about to go
                     self._collect_evaluations()
                 self._save(population, time.monotonic() - started)
@@ -253,7 +252,6 @@ class BatchedRuns:
         """All members, then the file that says so; what is older goes last. A kill at any point leaves a whole set."""
         n = population.n_updates
         for index, (model, folder) in enumerate(zip(population.models, self.folders, strict=True)):
-            model.num_timesteps = n
             if not self._diverged:
                 self._save_member(index, model, folder / _checkpoint(n), n)
         if self._diverged:

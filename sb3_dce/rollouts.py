@@ -21,7 +21,7 @@ from sb3_dce.checks import check_number
 from sb3_dce.data.catalog import resolve
 from sb3_dce.data.locate import catalogue_id, is_path
 from sb3_dce.data.minari import is_minari_name
-from sb3_dce.envs import make_env_if_possible, make_minari_env, missing_simulator, without_bookkeeping
+from sb3_dce.envs import make_env_if_possible, missing_simulator, own_env, without_bookkeeping
 from sb3_dce.errors import ConfigError
 from sb3_dce.locomotion import EnvSteps, fast_steps
 from sb3_dce.mlp_actor import MLPActor, actor_snapshot
@@ -208,11 +208,11 @@ def rollouts_of(dataset: str | None, n_episodes: int, n_envs: int | None = None)
         return make_rollouts(dataset_id, n_episodes, n_envs)
     if dataset is not None and not is_path(dataset) and not is_minari_name(dataset):
         resolve(dataset)  # which says what is known
-    if not is_minari_name(dataset) or make_minari_env(dataset) is None:
+    if dataset is None or own_env(dataset) is None:
         return None
 
     def make_env() -> gym.Env:
-        env = make_minari_env(dataset)
+        env = own_env(dataset)
         assert env is not None
         return env
 

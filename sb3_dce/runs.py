@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import platform
 import shutil
@@ -165,7 +166,10 @@ def _train(spec: RunSpec, model: OfflineAlgorithm, folder: Path, report: Report)
     model.planned_updates = spec.n_updates
     dataset_id = catalogue_id(model.dataset)
     write_config(spec, model, folder)
-    model.set_logger(Logger(str(folder), [make_output_format("csv", str(folder), f"_{model.num_timesteps}")]))
+    formats = [make_output_format("csv", str(folder), f"_{model.num_timesteps}")]
+    if model.tensorboard_log is not None:
+        formats.append(make_output_format("tensorboard", str(Path(model.tensorboard_log) / f"{spec.algo}_{spec.seed}")))
+    model.set_logger(Logger(str(folder), formats))
 
     def on_evaluation(outcome: Evaluation) -> None:
         report(Progress(spec.name, model.num_timesteps, spec.n_updates, outcome))
@@ -235,6 +239,21 @@ def write_divergence(folder: Path, n_updates: int, reason: str) -> None:
     :param reason: in words
     """
     write_text(folder / "diverged.json", json.dumps({"n_updates": n_updates, "reason": reason}))
+
+
+def last_metrics(folder: Path) -> dict[str, float]:
+    """
+    :param folder: of a run
+    :return: the diagnostics it logged last, by name without ``train/``; empty if there are none
+    """
+    logs = sorted(folder.glob("progress_*.csv"), key=lambda path: int(path.stem.rpartition("_")[2]))
+    for path in reversed(logs):
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+        if rows:
+            named = ((name.removeprefix("train/"), value) for name, value in rows[-1].items() if name.startswith("train/"))
+            return {name: float(value) for name, value in named if value}
+    return {}
 
 
 def read_divergence(folder: Path) -> dict[str, Any] | None:

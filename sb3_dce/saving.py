@@ -135,6 +135,8 @@ class SavingMixin(OffPolicyAlgorithm):
             raise CheckpointError(what, where=_name_of(source), hint=hint) from error
         if env is not None:
             model.set_env(env, force_reset)
+        else:
+            model.warn_without_statistics()  # type: ignore[attr-defined]  # AttachingMixin has it
         if not isinstance(model.dataset, str | None):
             raise CheckpointError(f"its dataset is {model.dataset!r}", where=_name_of(source), hint=DAMAGED)
         _refuse_not_finite(model, CheckpointError, f"{_name_of(source)} cannot be used")
@@ -208,7 +210,8 @@ def existing_zip(path: Path) -> Path:
     for candidate in (path, path.with_name(path.name + ".zip")):
         if candidate.is_file():
             return candidate
-    raise CheckpointError("no such file", where=str(path), path=path, hint="Give the path of a saved model, a .zip file.")
+    what = "a folder, not a saved model" if path.is_dir() else "no such file"
+    raise CheckpointError(what, where=str(path), path=path, hint="Give the path of a saved model, a .zip file.")
 
 
 def saved_algo(path: Path | io.BufferedIOBase) -> str | None:

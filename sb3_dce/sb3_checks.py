@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from importlib.util import find_spec
 from typing import Any
 
 import gymnasium as gym
@@ -61,6 +62,9 @@ def check_logging(verbose: Any, stats_window_size: Any, tensorboard_log: Any) ->
     if not isinstance(tensorboard_log, str | os.PathLike | None):
         hint = "None writes none."
         raise ConfigError(f"tensorboard_log must be a folder, got {tensorboard_log!r}", key="tensorboard_log", hint=hint)
+    if tensorboard_log is not None and find_spec("tensorboard") is None:
+        hint = 'Install it with: pip install "sb3_dce[track]"'
+        raise ConfigError("tensorboard_log needs TensorBoard, which is not installed", key="tensorboard_log", hint=hint)
 
 
 def named_env(env: GymEnv | str, verbose: int) -> GymEnv:
@@ -94,6 +98,8 @@ def check_policy_kwargs(given: Any, policy_class: type, settings: dict[str, Any]
         raise ConfigError(what, key="policy", hint=hint)
     known = [name for name in parameters if name not in ("observation_space", "action_space", "lr_schedule", "use_sde")]
     for name, value in given.items():
+        if name == "use_sde" and value is False:  # SB3's own algorithms write it into a dictionary they share with us
+            continue
         if name not in parameters:
             hint = f"It has {', '.join(known)}."
             raise ConfigError(f"{policy_class.__name__} has no parameter {name!r}", where="policy_kwargs", key=name, hint=hint)

@@ -18,12 +18,12 @@ from sb3_dce.checks import check_ends_with_evaluation
 from sb3_dce.data import find_file
 from sb3_dce.data.catalog import resolve
 from sb3_dce.data.locate import catalogue_id, short_name
-from sb3_dce.envs import missing_simulator
+from sb3_dce.envs import make_env, missing_simulator
 from sb3_dce.errors import CheckpointError, ConfigError
 from sb3_dce.evaluation import Evaluation, evaluate, read_evaluations
 from sb3_dce.launch import launch
 from sb3_dce.plots import plot_learning_curves
-from sb3_dce.rollouts import rollouts_of
+from sb3_dce.rollouts import Rollouts, rollouts_of
 from sb3_dce.runs import RunSpec
 from sb3_dce.saving import existing_zip, saved_algo
 
@@ -76,8 +76,11 @@ def train_seeds(
     curves = {algo: [read_evaluations(Path(s.folder), None if spec is None else spec.id) for s in specs]}
     picture = plot_learning_curves(curves, folder / "learning_curve.png", title=name)
     drawn = f", {picture.name}" if picture else ""
-    console.print(f"saved  {folder}/seed_*/model.zip, config.yml, evaluations.csv{drawn}", markup=False)
-    console.print(f"next   sb3-dce evaluate {specs[0].folder}/model.zip", markup=False)
+    evaluated = any(results) and results[0]["returns"] is not None
+    files = "model.zip, config.yml" + (", evaluations.csv" if evaluated else "")
+    console.print(f"saved  {folder}/seed_*/{files}{drawn}", markup=False)
+    needs = "" if evaluated else " --env <id of its environment>"
+    console.print(f"next   sb3-dce evaluate {specs[0].folder}/model.zip{needs}", markup=False)
     return results
 
 
@@ -103,17 +106,23 @@ def show_results(results: dict[str, list[dict[str, Any]]], console: Console) -> 
     console.print(table)
 
 
-def evaluate_file(model_path: Path, dataset: str | None, n_episodes: int, seed: int) -> Evaluation:
+def evaluate_file(model_path: Path, dataset: str | None, n_episodes: int, seed: int, env: str | None = None) -> Evaluation:
     """
     :param model_path: zip file of an agent
     :param dataset: id that names environment and score; ``None`` takes the model's own
     :param n_episodes: episodes
     :param seed: seed of the first episode
+    :param env: id of an environment instead of that of a dataset; there is no score then
     :return: outcome
     :raises CheckpointError: if the file is not a model of this package
     :raises ConfigError: if no environment is known or installed
     """
     model = load_any(model_path)
+    if env is not None:
+        if dataset is not None:
+            hint = "Give one of them: a dataset's environment comes with its score."
+            raise ConfigError("--env and --dataset both name an environment", key="--env", hint=hint)
+        return evaluate(model, Rollouts(lambda: make_env(env), n_episodes), seed)
     dataset_id = resolve(dataset).id if dataset is not None else catalogue_id(model.dataset)
     missing = None if dataset_id is None else missing_simulator(resolve(dataset_id))
     if missing is not None:
@@ -123,8 +132,8 @@ def evaluate_file(model_path: Path, dataset: str | None, n_episodes: int, seed: 
         raise ConfigError(
             f"no environment is known for {model.dataset!r}, on which the model was trained",
             key="dataset",
-            hint="Data of your own name none: use evaluate_policy(model, env) of Stable-Baselines3. Where a known dataset has "
-            "the same environment, name that with --dataset.",
+            hint="Give its id with --env, or use evaluate_policy(model, env) of Stable-Baselines3. Where a known dataset has "
+            "the same environment, --dataset adds the score.",
         )
     return evaluate(model, rollouts, seed, dataset_id)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -18,7 +19,7 @@ from sb3_dce import OfflineBC, OfflineDCE, load_dataset
 from sb3_dce.data.advice import examine
 from sb3_dce.data.selection import rows_of_best_episodes
 from sb3_dce.envs import SpacesEnv
-from sb3_dce.errors import DatasetError, DatasetFormatError, DatasetSemanticsError, DatasetWarning
+from sb3_dce.errors import DatasetError, DatasetFormatError, DatasetSemanticsError, DatasetWarning, SB3DCEError
 
 IDS = np.repeat(["B-12", "A-3", "B-1"], [5, 4, 6])
 
@@ -102,6 +103,55 @@ def test_rows_without_any_mark_are_said_to_be_one_episode(tmp_path: Path) -> Non
     frame(terminal=0).to_csv(tmp_path / "log.csv", index=False)
     found = {check.name: check.verdict for check in examine(tmp_path / "log.csv").checks}
     assert found["flags"] == "warning" and "other" not in found
+
+
+# -- lists of episodes -------------------------------------------------------------------------------------------------
+
+
+def episode(n: int, terminated: bool = False, **more: Any) -> dict[str, Any]:
+    rng = np.random.default_rng(n)
+    return {
+        "observations": rng.standard_normal((n + 1, 2)),
+        "actions": rng.uniform(-1, 1, (n, 1)),
+        "rewards": np.ones(n),
+        "terminations": np.arange(n) == (n - 1 if terminated else n),
+        **more,
+    }
+
+
+@pytest.mark.parametrize("kind", ["dictionaries", "objects", "dataset"])
+def test_a_list_of_episodes_is_a_dataset(kind: str) -> None:
+    episodes: list[Any] = [episode(5), episode(3, terminated=True), episode(4)]
+    source: Any = episodes if kind == "dictionaries" else [SimpleNamespace(**e) for e in episodes]
+    if kind == "dataset":
+        source = SimpleNamespace(iterate_episodes=lambda: iter(source_episodes))
+        source_episodes = [SimpleNamespace(**e) for e in episodes]
+    data = load_dataset(source)
+    assert len(data) == 12 and data.info.episode_lengths.tolist() == [5, 3, 4]
+    assert (data.info.n_terminals, data.info.n_timeouts) == (1, 2)
+    assert np.array_equal(data.next_observations[4], np.float32(episodes[0]["observations"][5]))
+
+
+def test_episodes_without_the_last_observation_lose_their_last_step() -> None:
+    episodes = [episode(5), episode(3, terminated=True)]
+    for e in episodes:
+        e["observations"] = e["observations"][:-1]
+    assert len(load_dataset(episodes)) == 7  # a true end needs no next observation
+
+
+@pytest.mark.parametrize(
+    ("episodes", "message"),
+    [
+        ([], "no episode in it"),
+        ([episode(3), 7], r"episode 1 \(int\) has no observations, actions, rewards"),
+        ([episode(3), {**episode(3), "rewards": np.ones(2)}], "episode 1 has different numbers of rows"),
+        ([episode(3), {**episode(3), "observations": np.ones((3, 2))}], "only some of the episodes"),
+        ([{**episode(3), "observations": {"a": np.ones(4)}}], "episode 0 are in parts"),
+    ],
+)
+def test_lists_that_are_none_of_episodes_are_refused(episodes: list[Any], message: str) -> None:
+    with pytest.raises(SB3DCEError, match=message):
+        load_dataset(episodes)
 
 
 # -- incomplete episodes -----------------------------------------------------------------------------------------------

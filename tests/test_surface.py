@@ -3,25 +3,34 @@
 from __future__ import annotations
 
 import inspect
+import signal
+import subprocess
+import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import h5py
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3 import SAC
 from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
+import sb3_dce as package
 from sb3_dce import OfflineBC, OfflineDCE, OfflineSACV, OfflineTD3BC, OfflineUWAC, Transitions
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.data import load_transitions
 from sb3_dce.envs import SpacesEnv
 from sb3_dce.errors import ConfigError, DatasetError, DatasetIntegrityError, DatasetWarning, SB3DCEWarning
 from sb3_dce.evaluation import EvaluationCallback, evaluate
+from sb3_dce.population import Population
 from sb3_dce.rollouts import make_rollouts, rollouts_of
 from tests.commands import sb3_dce
 from tests.test_agents import AGENTS, Agent, make
@@ -226,3 +235,144 @@ def test_writing_a_copy_of_the_data_is_said(tmp_path: Path) -> None:
 
 def _spaces() -> tuple[spaces.Box, spaces.Box]:
     return spaces.Box(-np.inf, np.inf, (17,), np.float64), spaces.Box(-1.0, 1.0, (6,), np.float32)
+
+
+# -- data without an environment of their own --------------------------------------------------------------------------
+
+
+@pytest.fixture
+def own_file(tmp_path: Path, transitions: Transitions) -> Path:
+    transitions.to_hdf5(tmp_path / "mine.hdf5")
+    return tmp_path / "mine.hdf5"
+
+
+def test_commands_on_data_without_an_environment(own_file: Path, tmp_path: Path) -> None:
+    small = ("--updates", "20", "--eval-freq", "10", "--set", "policy_kwargs={net_arch: [8]}", "--workers", "1")
+    trained = sb3_dce("train", str(own_file), "--algo", "bc", *small, "--out", str(tmp_path / "run"))
+    assert trained.code == 0 and "--env <id of its environment>" in trained.stdout
+    assert "evaluations.csv" not in trained.stdout
+    evaluated = sb3_dce("evaluate", str(tmp_path / "run" / "seed_0" / "model.zip"))
+    assert evaluated.code == 2 and "Give its id with --env" in evaluated.stderr
+    compared = sb3_dce(
+        "compare", "--dataset", str(own_file), "--algos", "bc,td3bc", "--seeds", "2", *small, "--out", str(tmp_path / "c")
+    )
+    assert compared.code == 0 and "Nothing was evaluated" in compared.stdout
+    table = (tmp_path / "c" / "comparison.md").read_text()
+    assert "| agent | action_dist | action_sat | q_data | q_policy | seeds |" in table.replace(" | set", "")
+    line = next(line for line in table.splitlines() if "offline_td3bc" in line)
+    assert "nan" not in line and line.count("|") > 6
+
+
+def test_an_environment_can_be_named_for_an_evaluation(tmp_path: Path) -> None:
+    OfflineBC.load_dataset(TINY, seed=0, policy_kwargs={"net_arch": [8]}).save(tmp_path / "model.zip")
+    model = str(tmp_path / "model.zip")
+    named = sb3_dce("evaluate", model, "--env", "HalfCheetah-v4", "--episodes", "1")
+    assert named.code == 0 and "return" in named.stdout and "score" not in named.stdout
+    returns = [
+        text.splitlines()[-1].split()[1] for text in (named.stdout, sb3_dce("evaluate", model, "--episodes", "1").stdout)
+    ]
+    assert returns[0] == returns[1]
+    assert "no environment" in sb3_dce("evaluate", model, "--env", "Nowhere-v0").stderr.replace("cannot make the", "no")
+    both = sb3_dce("evaluate", model, "--env", "HalfCheetah-v4", "--dataset", TINY)
+    assert both.code == 2 and "both name an environment" in both.stderr
+
+
+def test_recorded_files_say_where_they_are_evaluated(tmp_path: Path) -> None:
+    what = ("--policy", "random", "--env", "Pendulum-v1", "--steps", "400")
+    made = sb3_dce("datasets", "record", *what, "--out", str(tmp_path / "p.hdf5"))
+    assert made.code == 0, made.stderr
+    model = OfflineDCE.load_dataset(tmp_path / "p.hdf5", batch_size=8, policy_kwargs={"net_arch": [8]}).learn(2)
+    env = model.get_env()
+    assert env is not None and env.observation_space == gym.make("Pendulum-v1").observation_space
+    rollouts = rollouts_of(str(tmp_path / "p.hdf5"), 1)
+    assert rollouts is not None and len(evaluate(model, rollouts, seed=0).returns) == 1
+
+
+def test_a_name_in_a_file_imports_nothing(tmp_path: Path, transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
+    transitions.to_hdf5(tmp_path / "mine.hdf5")
+    with h5py.File(tmp_path / "mine.hdf5", "a") as file:
+        file.attrs["env_id"] = "antigravity:Env-v0"
+    assert rollouts_of(str(tmp_path / "mine.hdf5"), 1) is None and "antigravity" not in sys.modules
+
+
+# -- command line ------------------------------------------------------------------------------------------------------
+
+
+def test_no_updates_are_not_a_million(tmp_path: Path) -> None:
+    outcome = sb3_dce("train", TINY, "--updates", "0", "--out", str(tmp_path / "run"))
+    assert outcome.code == 2 and not (tmp_path / "run").exists()
+
+
+def test_version_and_module() -> None:
+    assert sb3_dce("--version").stdout.strip() == f"sb3_dce {package.__version__}"
+    done = subprocess.run([sys.executable, "-m", "sb3_dce", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == f"sb3_dce {package.__version__}"
+
+
+def test_tensorboard_is_written_by_runs_that_ask_for_it(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    small = ("--updates", "10", "--eval-freq", "10", "--eval-episodes", "1", "--set", "policy_kwargs={net_arch: [8]}")
+    options = (*small, "--set", f"tensorboard_log={tmp_path / 'tb'}", "--out", str(tmp_path / "run"), "--workers", "1")
+    assert sb3_dce("train", TINY, "--algo", "bc", *options).code == 0
+    assert list((tmp_path / "tb" / "offline_bc_0").glob("events.*"))
+
+
+# -- what users of Stable-Baselines3 share -----------------------------------------------------------------------------
+
+
+def test_a_dictionary_shared_with_sac_is_taken(transitions: Transitions, make_point_mass: Callable[[], gym.Env]) -> None:
+    shared: dict[str, Any] = {"net_arch": [8]}
+    SAC("MlpPolicy", make_point_mass(), policy_kwargs=shared)
+    OfflineDCE("MlpPolicy", dataset=transitions, policy_kwargs={**shared, "use_sde": False})
+
+
+def test_a_model_without_its_normalisation_is_loaded_with_a_warning(
+    transitions: Transitions, make_point_mass: Callable[[], gym.Env], tmp_path: Path
+) -> None:
+    env = VecNormalize(DummyVecEnv([make_point_mass]), norm_reward=False)
+    model = OfflineBC("MlpPolicy", env, transitions, batch_size=8, policy_kwargs={"net_arch": [8]}).learn(1)
+    model.save(tmp_path / "model.zip")
+    with pytest.warns(SB3DCEWarning, match="trained behind a VecNormalize"):
+        OfflineBC.load(tmp_path / "model.zip")
+    with pytest.warns(SB3DCEWarning, match="trained behind a VecNormalize"):
+        OfflineBC.load(tmp_path / "model.zip", env=DummyVecEnv([make_point_mass]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        OfflineBC.load(tmp_path / "model.zip", env=env)
+
+
+def test_members_of_a_population_are_trained_models_at_once(transitions: Transitions, tmp_path: Path) -> None:
+    models = [make(AGENTS["BC"], dataset=transitions, seed=seed) for seed in (0, 1)]
+    before = [p.clone() for p in models[1].policy.parameters()]
+    population = Population(models)
+    population.train(3)
+    models[1].save(tmp_path / "model.zip")
+    assert not all(th.equal(p, q) for p, q in zip(before, models[1].policy.parameters(), strict=True))
+    loaded = OfflineBC.load(tmp_path / "model.zip")
+    assert loaded.num_timesteps == loaded._n_updates == 3
+    population.train(2)
+    assert models[0].num_timesteps == 5
+    for wrong in (-1, 1.5, "3"):
+        with pytest.raises(ConfigError, match="n_updates must be a whole number"):
+            population.train(wrong)  # type: ignore[arg-type]
+
+
+def test_an_interrupted_population_keeps_what_it_has(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
+    models = [make(AGENTS["BC"], dataset=transitions, seed=seed) for seed in (0, 1)]
+    population = Population(models)
+    draw, calls = population._draw, []
+
+    def interrupted(*args: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 3:
+            signal.raise_signal(signal.SIGINT)
+        return draw(*args)
+
+    monkeypatch.setattr(population, "_draw", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        population.train(10)
+    assert models[0]._n_updates == models[0].num_timesteps == population.n_updates == 3
+    other = Population([make(AGENTS["BC"], dataset=transitions, seed=seed) for seed in (0, 1)])
+    other.train(3)
+    for p, q in zip(models[0].policy.parameters(), other.models[0].policy.parameters(), strict=True):
+        assert th.equal(p, q)

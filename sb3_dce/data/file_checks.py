@@ -47,7 +47,7 @@ def read_head(path: Path) -> bytes:
         raise DatasetFormatError(
             "a zip archive, not HDF5",
             where=str(path),
-            hint="A saved model is opened with its class's load(); the arrays of an .npz go to Transitions.from_arrays",
+            hint="A saved model is opened with its class's load(); arrays of NumPy belong into a file that ends in .npz",
             path=path,
         )
     if head[:1] == b"\x80" and head[1:2] <= b"\x05":  # protocols 2 to 5

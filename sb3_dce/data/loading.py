@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from os import PathLike
 from typing import Any
 
+from sb3_dce.data.episode_list import arrays_from_episodes
 from sb3_dce.data.hash_record import as_sha256, verify_hash, verify_record
 from sb3_dce.data.layout import CORE_KEYS, EPISODES, REQUIRED_KEYS
 from sb3_dce.data.locate import find_file
@@ -57,7 +58,8 @@ def load_dataset(source: Any, **options: Any) -> Transitions:
     The front door: whatever holds logged steps becomes a dataset.
 
     :param source: id, alias or file as for :func:`load_transitions`; a pandas data frame; a dictionary of arrays with the
-        keys of :meth:`Transitions.from_arrays`; a replay buffer of Stable-Baselines3; or ``Transitions``
+        keys of :meth:`Transitions.from_arrays`; a list of episodes, each a dictionary of arrays or an episode of Minari, or
+        a loaded dataset of Minari; a replay buffer of Stable-Baselines3; or ``Transitions``
     :param options: fields of :class:`~sb3_dce.data.records.ReadOptions`, and options of the reader
     :return: the dataset
     :raises ConfigError: for any other object, or options for data that are read already
@@ -85,6 +87,10 @@ def load_dataset(source: Any, **options: Any) -> Transitions:
                 hint="Rename its keys; timeouts, next_observations and episodes (an id per row) may be left out.",
             )
         return Transitions.from_arrays(**source, **options)
+    if isinstance(source, list | tuple) or hasattr(source, "iterate_episodes"):
+        episodes = source if isinstance(source, list | tuple) else source.iterate_episodes()
+        arrays: dict[str, Any] = arrays_from_episodes(episodes)
+        return Transitions.from_arrays(**arrays, **options)
     if type(source).__module__.partition(".")[0] == "pandas":
         return Transitions.from_dataframe(source, **options)
     if hasattr(source, "buffer_size"):
@@ -92,5 +98,5 @@ def load_dataset(source: Any, **options: Any) -> Transitions:
     raise ConfigError(
         f"a dataset cannot be made of {type(source).__name__}",
         key="source",
-        hint="Give an id, a file, a data frame, a dictionary of arrays, a replay buffer, or Transitions.",
+        hint="Give an id, a file, a data frame, a dictionary of arrays, a list of episodes, a replay buffer, or Transitions.",
     )

@@ -8,9 +8,6 @@ which differs between BLAS kernels and which the simulators would amplify.
 
 from __future__ import annotations
 
-import contextlib
-import importlib
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,9 +16,8 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_dce.data.catalog import DatasetSpec, all_specs
-from sb3_dce.data.locate import known_dataset
-from sb3_dce.envs import make_env_if_possible, missing_simulator, without_bookkeeping
+from sb3_dce.data.catalog import all_specs
+from sb3_dce.envs import make_env, without_bookkeeping
 from sb3_dce.errors import ConfigError, DatasetSemanticsError
 from sb3_dce.numpy_policy import NumpyPolicy
 from sb3_dce.recording.policy_files import PolicyFacts, load_policy
@@ -231,48 +227,6 @@ class EpisodeRunner:
                 hint="Check the environment; a smaller noise or another policy may keep it stable.",
             )
         return arrays
-
-
-def make_env(env_id: str) -> gym.Env:
-    """
-    The environment with this id, or that of the dataset with this id.
-
-    :param env_id: id of Gymnasium, or id or alias of the catalogue
-    :return: environment with its time limit
-    :raises ConfigError: if it is unknown or its simulator is missing
-    """
-    spec = dataset_of_env(env_id)
-    if spec is not None:
-        missing = missing_simulator(spec)
-        if missing is not None:
-            raise ConfigError(missing.reason, where=spec.id, key="env", hint=missing.remedy)
-        return make_env_if_possible(spec.id)
-    if env_id not in gym.registry:
-        # registers its environments, and says at import what it has changed, whatever is asked for
-        with contextlib.suppress(ImportError), contextlib.redirect_stderr(io.StringIO()):
-            importlib.import_module("gymnasium_robotics")
-    try:
-        return gym.make(env_id, disable_env_checker=True)
-    except (gym.error.Error, ImportError, TypeError, ValueError) as error:
-        raise ConfigError(
-            f"cannot make the environment {env_id!r} ({type(error).__name__}: {error})",
-            key="env",
-            hint="Give an id such as HalfCheetah-v4, a dataset id such as pen-human-v0, or module:EnvId.",
-        ) from error
-
-
-def dataset_of_env(env_id: str) -> DatasetSpec | None:
-    """
-    A dataset whose environment this is.
-
-    ``HalfCheetah-v4`` is that of the datasets, and is then made without Gymnasium's and MuJoCo's remarks;
-    ``AdroitHandDoor-v1`` by itself is not, since the datasets' one pays another reward.
-
-    :param env_id: id of Gymnasium, or id or alias of the catalogue
-    :return: entry of the catalogue, ``None`` if there is none
-    """
-    by_env = (spec for spec in all_specs() if spec.env_id == env_id and spec.family == "gym")
-    return known_dataset(env_id) or next(by_env, None)
 
 
 def concatenate(parts: Sequence[Arrays]) -> Arrays:

@@ -26,11 +26,12 @@ from sb3_dce.data.hashes import content_hash
 from sb3_dce.data.hdf5 import write_hdf5
 from sb3_dce.data.locate import known_dataset
 from sb3_dce.data.records import bounds_attribute
+from sb3_dce.envs import dataset_of_env
 from sb3_dce.errors import ConfigError, SB3DCEError
 from sb3_dce.files import check_writable
 from sb3_dce.numpy_policy import NumpyPolicy
 from sb3_dce.processes import prepare_worker
-from sb3_dce.recording.episodes import Arrays, EpisodeRunner, RecordingSpec, dataset_of_env
+from sb3_dce.recording.episodes import Arrays, EpisodeRunner, RecordingSpec
 from sb3_dce.recording.parts import Parts
 
 # Rows of one task of a worker: some tenths of a second, so that sending them costs little and the progress moves.

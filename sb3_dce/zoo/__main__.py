@@ -59,6 +59,9 @@ def launch(argv: list[str]) -> None:
     :raises ConfigError: if the script, the algorithm or the environment is unknown, or a package is missing
     """
     script = argv[0] if argv else ""
+    if script in ("-h", "--help"):
+        print(f"usage: python -m sb3_dce.zoo SCRIPT [arguments of rl_zoo3]\nscripts: {', '.join(SCRIPTS)}")
+        return
     if script not in SCRIPTS:
         what = f"unknown script {script!r}" if script else "no script given"
         raise ConfigError(what, hint=f"{hyperparams.did_you_mean(script, SCRIPTS)}Scripts: {', '.join(SCRIPTS)}.")

@@ -1,0 +1,68 @@
+"""Lists of episodes, each with its own arrays, as Minari hands them out and as people keep them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from sb3_dce.errors import ConfigError, DatasetFormatError
+
+_OTHER_NAMES = {"terminals": "terminations", "timeouts": "truncations"}
+_NEEDED = ("observations", "actions", "rewards")
+
+
+def arrays_from_episodes(episodes: Iterable[Any]) -> dict[str, np.ndarray]:
+    """
+    Arrays of all steps. Observations may have one row more than actions, the one after the last step; then each step knows
+    its next one, else ``next_observations`` may be there. The last row of an episode ends it, by a timeout unless it is
+    marked as a true end.
+
+    :param episodes: dictionaries, or objects with such attributes: ``observations, actions, rewards``, and where present
+        ``terminals`` (or Minari's ``terminations``), ``timeouts`` (``truncations``) and ``next_observations``
+    :return: key to array
+    :raises ConfigError: if something is no episode
+    :raises DatasetFormatError: if the arrays of an episode do not fit together, or only some have a next observation
+    """
+    parts = [_arrays_of(episode, number) for number, episode in enumerate(episodes)]
+    if not parts:
+        raise ConfigError("there is no episode in it", key="source", hint="Give at least one.")
+    if len({frozenset(part) for part in parts}) > 1:
+        raise DatasetFormatError(
+            "only some of the episodes have the observation after their last step",
+            hint="Give it for all, or leave it out for all",
+            key="next_observations",
+        )
+    return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+
+
+def _arrays_of(episode: Any, number: int) -> dict[str, np.ndarray]:
+    def find(name: str) -> Any:
+        for alias in (name, _OTHER_NAMES.get(name, name)):
+            found = episode.get(alias) if isinstance(episode, Mapping) else getattr(episode, alias, None)
+            if found is not None:
+                return found
+        return None
+
+    given = {name: find(name) for name in (*_NEEDED, *_OTHER_NAMES, "next_observations")}
+    missing = [name for name in _NEEDED if given[name] is None]
+    if missing:
+        what = f"episode {number} ({type(episode).__name__}) has no {', '.join(missing)}"
+        raise ConfigError(what, key="source", hint="Give dictionaries of arrays, or episodes of Minari.")
+    if isinstance(given["observations"], Mapping):
+        hint = "Flatten them into vectors; a dataset of Minari is given by its id, with flatten=True"
+        raise DatasetFormatError(f"the observations of episode {number} are in parts", hint=hint, key="observations")
+    arrays = {name: np.asarray(value) for name, value in given.items() if value is not None}
+    n = len(arrays["actions"])
+    if len(arrays["observations"]) == n + 1:
+        arrays["next_observations"] = arrays["observations"][1:]
+        arrays["observations"] = arrays["observations"][:-1]
+    for name in _OTHER_NAMES:
+        arrays[name] = arrays.get(name, np.zeros(n)).astype(bool)
+    lengths = {name: len(array) for name, array in arrays.items()}
+    if n == 0 or len(set(lengths.values())) > 1:
+        shown = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise DatasetFormatError(f"episode {number} has different numbers of rows: {shown}", hint="One row per step")
+    arrays["timeouts"][-1] |= not arrays["terminals"][-1]
+    return arrays
