@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# options of pip for torch alone: which index it comes from decides whether gigabytes of CUDA libraries come with it
+TORCH_OPTIONS ?=
 # two test processes where there are two cores; 0 switches pytest-xdist off
 WORKERS ?= $(shell [ "$$(getconf _NPROCESSORS_ONLN)" -ge 2 ] && echo 2 || echo 0)
 
@@ -29,8 +31,10 @@ check: lint type test
 
 # torch first and by its pin, see constraints.txt
 $(STAMP): setup.cfg pyproject.toml constraints.txt
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install -c constraints.txt torch
+	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11))" \
+		|| { echo "$(PYTHON) is not Python 3.11 or later. Name one: make demo PYTHON=python3.12 (pip install . takes 3.10)"; exit 1; }
+	$(PYTHON) -m venv --clear $(VENV)
+	$(BIN)/python -m pip install -c constraints.txt $(TORCH_OPTIONS) torch
 	$(BIN)/python -m pip install -c constraints.txt -e ".[dev]"
 	touch $(STAMP)
 

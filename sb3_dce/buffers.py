@@ -150,7 +150,8 @@ class OfflineReplayBuffer(ReplayBuffer):
     def _with_scaled_actions(self, rows: th.Tensor) -> th.Tensor:
         space = self.action_space
         assert isinstance(space, spaces.Box)
-        low, high = (th.as_tensor(bound, dtype=th.float32).reshape(-1) for bound in (space.low, space.high))
+        bounds = (th.as_tensor(bound, dtype=th.float32, device=rows.device) for bound in (space.low, space.high))
+        low, high = (bound.reshape(-1) for bound in bounds)
         if bool((low == -1.0).all()) and bool((high == 1.0).all()):
             return rows
         rows = rows.clone()

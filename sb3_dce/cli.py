@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import io
 import sys
 import warnings
 from pathlib import Path
@@ -16,6 +16,7 @@ from sb3_dce import cli_datasets
 from sb3_dce.checks import LAST_SEED
 from sb3_dce.cli_datasets import DatasetArgument
 from sb3_dce.errors import ConfigError, SB3DCEError
+from sb3_dce.processes import usable_cores
 
 app = typer.Typer(
     help="Offline reinforcement learning for people who know Stable-Baselines3.",
@@ -93,7 +94,7 @@ def train(
         seeds=range(first_seed, first_seed + seeds),
         eval_freq=eval_freq,
         n_eval_episodes=eval_episodes,
-        workers=workers or os.cpu_count() or 1,
+        workers=workers or usable_cores(),
         out=out,
         overrides=_parse_overrides(set_ or []),
         console=console,
@@ -131,7 +132,7 @@ def compare(
     from sb3_dce.compare import compare as run_comparison
 
     names = list(_names(algos))
-    n_workers = workers or os.cpu_count() or 1
+    n_workers = workers or usable_cores()
     run_comparison(
         *(dataset, names, _steps(updates), range(seeds), eval_freq, eval_episodes, n_workers, out, console),
         overrides=_parse_overrides(set_ or []),
@@ -204,7 +205,7 @@ def reproduce(
         first_seed=first_seed,
         updates=None if updates is None else _steps(updates),
         eval_freq=eval_freq,
-        workers=workers or os.cpu_count() or 1,
+        workers=workers or usable_cores(),
         device=device,
         ray_address=ray_address,
         reuse=tuple(reuse or ()),
@@ -290,6 +291,9 @@ def _parse_lengths(pairs: list[str]) -> dict[str, int]:
 def main() -> None:
     """Entry point: errors of this package are one message on stderr and exit code 2, never a traceback."""
     warnings.showwarning = _show_warning  # type: ignore[assignment]
+    for stream in (sys.stdout, sys.stderr):  # an encoding without a sign such as ± is no reason to end a training
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     try:
         app()
     except SB3DCEError as error:

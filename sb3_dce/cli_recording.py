@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
+
+from sb3_dce.processes import usable_cores
 
 if TYPE_CHECKING:
     from sb3_dce.recording import Recorded
@@ -106,7 +107,7 @@ def record_dataset(
             n_rows,
             episodes,
             name,
-            workers or os.cpu_count() or 1,
+            workers or usable_cores(),
             force,
             progress=lambda done, total: progress("recording", done, total),
         )
@@ -163,7 +164,7 @@ def generate_dataset(
             Training(target, {"max_steps": train_steps}),
             rows,
             seed,
-            workers or os.cpu_count() or 1,
+            workers or usable_cores(),
             force,
             progress=progress,
             note=lambda text: console.print(text, markup=False, soft_wrap=True),

@@ -217,7 +217,8 @@ def summarize(
     title = short_name(specs[0].dataset) if dataset_id is None else dataset_id
     picture = plot_learning_curves(curves, folder / "comparison.png", title, levels, confidence=True)
     _write_markdown(folder / "comparison.md", title, table, notes, picture)
-    console.print(f"saved  {folder}/comparison.md, comparison.csv" + (f", {picture.name}" if picture else ""), markup=False)
+    drawn = f", {picture.name}" if picture else ""
+    console.print(f"saved  {folder}/comparison.md, comparison.csv{drawn}", markup=False, soft_wrap=True)
     return rows
 
 

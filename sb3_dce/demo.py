@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
+import shlex
 import shutil
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from sb3_dce.execution import choose_execution
 from sb3_dce.files import write_text
 from sb3_dce.launch import launch
 from sb3_dce.plots import plot_learning_curves
+from sb3_dce.processes import usable_cores
 from sb3_dce.rollouts import Rollouts, make_rollouts
 from sb3_dce.runs import RunSpec, alone
 
@@ -67,13 +68,13 @@ def run_demo(folder: Path, n_seeds: int, fresh: bool, console: Console) -> dict[
         raise ConfigError("the demo evaluates in MuJoCo, which is not installed", key="mujoco", hint="pip install mujoco")
     if choose_execution("auto", N_UPDATES, th.device("cpu")) == "eager":
         n_seeds = 1
-        console.print("No C++ compiler found: updates run uncompiled, about four times slower, so with one seed only.")
+        console.print("No C++ compiler, or no Python.h: updates run uncompiled, four times slower, so with one seed only.")
     specs = [demo_spec(algo, seed, folder) for seed in range(n_seeds) for algo in ("dce", "offline_bc")]
     setting = f"networks {SHARED['policy_kwargs']['net_arch']}   learning rate {SHARED['learning_rate']:g}"
     console.print(
         f"\nDCE and BC   {n_seeds} seeds each   {N_UPDATES:,} gradient steps   {setting}   beta {DCE_ONLY['beta']:g}\n"
     )
-    results = launch(sorted(specs, key=lambda s: s.algo), os.cpu_count() or 1, console)
+    results = launch(sorted(specs, key=lambda s: s.algo), usable_cores(), console)
     table = {
         "random": _random_returns(rollouts),
         "data": transitions.info.episode_returns.tolist(),
@@ -88,10 +89,13 @@ def run_demo(folder: Path, n_seeds: int, fresh: bool, console: Console) -> dict[
     }
     levels = {name: float(normalized_score(DATASET, np.mean(table[name]))) for name in ("data", "random")}
     picture = plot_learning_curves(curves, folder / "learning_curve.png", DATASET, levels)
-    console.print(f"\nsaved  {folder}/dce_0/model.zip  config.yml  evaluations.csv  evaluations.npz", markup=False)
+    console.print(
+        f"\nsaved  {folder}/dce_0/model.zip  config.yml  evaluations.csv  evaluations.npz", markup=False, soft_wrap=True
+    )
     plot = picture.name if picture else "(no plot: pip install matplotlib)"
-    console.print(f"       {folder}/results.json  {plot}", markup=False)
-    console.print(f"next   sb3-dce evaluate {folder}/dce_0/model.zip", markup=False)
+    console.print(f"       {folder}/results.json  {plot}", markup=False, soft_wrap=True)
+    model = shlex.quote(f"{folder}/dce_0/model.zip")
+    console.print(f"next   sb3-dce evaluate {model}", markup=False, soft_wrap=True)
     return table
 
 
@@ -100,7 +104,11 @@ def _delete_demo(folder: Path) -> None:
     for path in folder.iterdir():
         if path.is_dir() and path.name.startswith(("dce_", "offline_bc_")):
             with alone(path):
-                shutil.rmtree(path)
+                for inner in path.iterdir():
+                    if inner.name == ".lock":  # it is open, which some systems do not let one delete
+                        continue
+                    shutil.rmtree(inner) if inner.is_dir() else inner.unlink()
+            shutil.rmtree(path, ignore_errors=True)
         elif path.name in ("results.json", "learning_curve.png"):
             path.unlink()
 

@@ -79,6 +79,10 @@ class DownloadError(SB3DCEError, OSError):
     """A dataset could not be downloaded."""
 
 
+class LockedError(SB3DCEError, OSError):
+    """Another process is at the same file or folder and does not come to an end."""
+
+
 class CheckpointError(SB3DCEError):
     """A saved model is damaged, incomplete or belongs to something else, or cannot be written."""
 

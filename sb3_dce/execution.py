@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import sysconfig
 import warnings
 from collections.abc import Callable, Hashable, Iterator
+from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
 import torch as th
@@ -59,7 +61,8 @@ def choose_execution(execution: str, planned_updates: int, device: th.device) ->
     if wanted == "compile" and not _has_compiler():
         if execution != "auto":
             warnings.warn(
-                f"execution={execution!r} needs a C++ compiler (g++ or clang++) on the PATH and found none: running eager.",
+                f"execution={execution!r} needs a C++ compiler (g++ or clang++) on the PATH and the headers of Python "
+                "(python3-dev), and did not find both: running eager.",
                 SB3DCEWarning,
             )
         return "eager"
@@ -67,7 +70,15 @@ def choose_execution(execution: str, planned_updates: int, device: th.device) ->
 
 
 def _has_compiler() -> bool:
-    return any(shutil.which(name) for name in ("g++", "clang++", "c++", "cl"))
+    """Also whether the headers of Python are there, which some systems keep in a package of their own."""
+    headers = (Path(sysconfig.get_path("include")) / "Python.h").is_file()
+    return headers and any(shutil.which(name) for name in ("g++", "clang++", "c++", "cl"))
+
+
+def _cause(error: Exception) -> str:
+    """The line of a compiler's output that says what is wrong; the first only names the kind of error."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
+    return next((line for line in lines[1:] if "error:" in line), lines[0])
 
 
 def _room_for_compiled_updates() -> contextlib.AbstractContextManager[None]:
@@ -222,7 +233,7 @@ class Engine(Generic[S]):
                 if th.cuda.is_available() and th.cuda.is_current_stream_capturing():
                     raise  # whatever would follow could not become part of this capture
                 way = "capturing it as it is" if self.execution == "cudagraph" else "running eager"
-                warnings.warn(f"compiling the update failed, {way}: {str(error).splitlines()[0]}", SB3DCEWarning)
+                warnings.warn(f"compiling the update failed, {way}: {_cause(error)}", SB3DCEWarning)
                 self._compiled[key] = self._in_place(dict(key))
                 if self.execution == "compile":
                     self.execution = "eager"

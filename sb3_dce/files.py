@@ -10,6 +10,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from os import PathLike
 from typing import BinaryIO
 
 from sb3_dce.errors import CheckpointError
@@ -97,6 +98,17 @@ def sync_folder(folder: pathlib.Path) -> None:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
+
+
+def expanded(path: str | PathLike[str]) -> pathlib.Path:
+    """
+    :param path: may begin with ``~`` or ``~user``
+    :return: with their home folder in its place, unless there is none
+    """
+    try:
+        return pathlib.Path(path).expanduser()
+    except RuntimeError:
+        return pathlib.Path(path)
 
 
 def check_writable(target: pathlib.Path) -> None:

@@ -10,6 +10,7 @@ import difflib
 import inspect
 from collections.abc import Iterable
 from importlib import resources
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import yaml
@@ -54,7 +55,10 @@ class SplitRow(NamedTuple):
 
 
 def _folder() -> Traversable:
-    return resources.files("sb3_dce.zoo_hyperparams")
+    try:
+        return resources.files("sb3_dce.zoo_hyperparams")
+    except ModuleNotFoundError:  # a checkout that is not installed, or that hides the package which is
+        return Path(__file__).resolve().parents[1] / "zoo_hyperparams"
 
 
 def known_algorithms() -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing as mp
-import os
 import queue
 import sys
 import traceback
@@ -20,7 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from sb3_dce import runs
 from sb3_dce.errors import DivergenceError, SB3DCEError
 from sb3_dce.evaluation import Evaluation
-from sb3_dce.processes import prepare_worker, threads_from_environment
+from sb3_dce.processes import prepare_worker, threads_from_environment, usable_cores
 from sb3_dce.runs import RunSpec
 
 # With more runs than this the bars of those that are done make room for the others.
@@ -64,14 +63,15 @@ def launch_all(specs: Sequence[RunSpec], workers: int, console: Console) -> list
 def _killed() -> RunFailedError:
     return RunFailedError(
         "a training process was ended from outside, as the system does when memory is short",
-        hint="Use fewer --workers; the same command goes on from the last checkpoints.",
+        hint="Use fewer --workers; the same command goes on from the last checkpoints. A script that starts processes must do "
+        'so below if __name__ == "__main__":.',
     )
 
 
 def _launch(specs: Sequence[RunSpec], workers: int, console: Console, keep_going: bool) -> list[Future[Any]]:
     workers = max(1, min(workers, len(specs)))
     # The user's own setting wins: more threads than free cores make PyTorch many times slower.
-    threads = threads_from_environment() or max(1, (os.cpu_count() or 1) // workers)
+    threads = threads_from_environment() or max(1, usable_cores() // workers)
     context = mp.get_context("spawn")
     events = context.Queue()
     with progress_display(console) as display:

@@ -89,9 +89,11 @@ class MLPActor:
 
     def __init__(self, snapshot: ActorSnapshot) -> None:
         # copied into PyTorch's own memory: the bits of a matrix product may depend on how its operands are aligned
-        self._layers = [(th.tensor(weight).t(), th.tensor(bias)) for weight, bias in snapshot.layers]
+        layers = [[th.tensor(array, device="cpu") for array in layer] for layer in snapshot.layers]
+        self._layers = [(weight.t(), bias) for weight, bias in layers]
         self._activate = IN_PLACE[snapshot.activation]
-        self._standardize = None if snapshot.standardize is None else [th.tensor(array) for array in snapshot.standardize]
+        scales = snapshot.standardize
+        self._standardize = None if scales is None else [th.tensor(array, device="cpu") for array in scales]
         self._squash, self._low, self._high = snapshot.squash, snapshot.low, snapshot.high
         self._range = snapshot.high - snapshot.low
         self._buffers: list[th.Tensor] = []
@@ -103,7 +105,7 @@ class MLPActor:
         """
         if not self._buffers or len(self._buffers[0]) != len(obs):
             widths = [len(self._layers[0][0]), *(len(bias) for _, bias in self._layers)]
-            self._buffers = [th.empty(len(obs), width) for width in widths]
+            self._buffers = [th.empty(len(obs), width, device="cpu") for width in widths]
         x = self._buffers[0].copy_(th.from_numpy(obs))
         if self._standardize is not None:
             x.sub_(self._standardize[0]).div_(self._standardize[1])

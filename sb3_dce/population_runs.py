@@ -7,7 +7,6 @@ same runs are processes, one per core.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -31,6 +30,7 @@ from sb3_dce.evaluation_pool import EvaluationPool, PendingEpisodes
 from sb3_dce.files import write_atomically
 from sb3_dce.launch import launch, progress_display, show_evaluation
 from sb3_dce.population import Population
+from sb3_dce.processes import usable_cores
 from sb3_dce.rollouts import Rollouts, rollouts_of
 from sb3_dce.runs import RunSpec, alone, read_result, refuse_other_run, write_config, write_divergence, write_result
 
@@ -68,7 +68,7 @@ def train_population(
     device = get_device(device)
     if device.type == "cpu":
         return launch([replace(spec, device="cpu") for spec in specs], workers or 1, console)
-    workers = max(1, (os.cpu_count() or 1) - 1) if workers is None else workers
+    workers = max(1, usable_cores() - 1) if workers is None else workers
     return BatchedRuns(specs, device, execution, console, state_file=state_file, workers=workers).run()
 
 

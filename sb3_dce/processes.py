@@ -47,6 +47,17 @@ def threads_from_environment() -> int:
     return int(first) if first.isdecimal() else 0
 
 
+def usable_cores() -> int:
+    """
+    :return: cores this process may use, which a batch system or ``taskset`` may have limited; at most 61 on Windows, where a
+        pool takes no more
+    """
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    cores = os.cpu_count() or 1
+    return min(cores, 61) if os.name == "nt" else cores
+
+
 def prepare_worker() -> None:
     """
     To be called first in a worker process: Ctrl-C is for the parent, which ends its workers, and a parent that was killed,

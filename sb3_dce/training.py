@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -78,9 +79,10 @@ def train_seeds(
     drawn = f", {picture.name}" if picture else ""
     evaluated = any(results) and results[0]["returns"] is not None
     files = "model.zip, config.yml" + (", evaluations.csv" if evaluated else "")
-    console.print(f"saved  {folder}/seed_*/{files}{drawn}", markup=False)
+    console.print(f"saved  {folder}/seed_*/{files}{drawn}", markup=False, soft_wrap=True)
     needs = "" if evaluated else " --env <id of its environment>"
-    console.print(f"next   sb3-dce evaluate {specs[0].folder}/model.zip{needs}", markup=False)
+    model = shlex.quote(f"{specs[0].folder}/model.zip")
+    console.print(f"next   sb3-dce evaluate {model}{needs}", markup=False, soft_wrap=True)
     return results
 
 

@@ -66,7 +66,7 @@ class UWACPolicy(OfflineSACPolicy):
         )
         # Not in the state dict: they follow from the seed, and a model may be loaded with other numbers of them.
         generator = th.Generator().manual_seed(self.predict_seed)
-        noise = th.randn(self.n_predict_actions, 1, get_action_dim(self.action_space), generator=generator)
+        noise = th.randn(self.n_predict_actions, 1, get_action_dim(self.action_space), generator=generator, device="cpu")
         self.register_buffer("candidate_noise", noise, persistent=False)
         for index, mask in enumerate(self._draw_masks(generator, generator.device)):
             self.register_buffer(f"predict_mask_{index}", mask, persistent=False)

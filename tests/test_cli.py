@@ -208,6 +208,7 @@ def children_of(pid: int) -> list[int]:
     return found
 
 
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds the processes in /proc")
 def test_training_process_that_is_killed_is_one_clear_message(tmp_path: Path) -> None:
     command = ["compare", "--dataset", TINY, "--algos", "bc", "--seeds", "1", "--updates", "1e6", "--eval-freq", "1000000"]
     arguments = [sys.executable, "-c", "from sb3_dce.cli import main; main()", *command, *FAST, "--out", str(tmp_path)]

@@ -31,11 +31,11 @@ from sb3_dce.data.catalog import D4RL_URL, DatasetSpec, resolve
 from sb3_dce.data.file_checks import HDF5_SIGNATURE
 from sb3_dce.data.hash_record import as_sha256, read_record, record_path, verify_hash, verify_record, write_record
 from sb3_dce.data.hdf5 import D4RLFile
-from sb3_dce.data.locate import DATASETS_VARIABLE, search, search_folders
+from sb3_dce.data.locate import DATASETS_VARIABLE, cache_folder, search, search_folders
 from sb3_dce.data.locking import exclusive
 from sb3_dce.data.network import Failed, Patience, make_opener, network_errors
 from sb3_dce.errors import CheckpointError, DatasetError, DatasetIntegrityError, DownloadError
-from sb3_dce.files import sync_folder, write_text
+from sb3_dce.files import expanded, sync_folder, write_text
 
 _LOG = logging.getLogger(__name__)
 MIRRORS_VARIABLE = "SB3_DCE_MIRRORS"
@@ -100,7 +100,7 @@ def download(
     :raises ConfigError: if ``sha256`` is no hash
     """
     spec, pin = resolve(name), as_sha256(sha256)
-    target = (search_folders()[0] if cache_dir is None else Path(cache_dir).expanduser()) / spec.file_name
+    target = ((search_folders() or [cache_folder()])[0] if cache_dir is None else expanded(cache_dir)) / spec.file_name
     if not force:
         elsewhere = search(spec) if cache_dir is None or spec.url is None else None
         if (here := target if target.is_file() else elsewhere) is not None:

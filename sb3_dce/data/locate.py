@@ -9,13 +9,15 @@ as in ``$PATH``), the cache ``~/.cache/sb3_dce/datasets``, and D4RL's own folder
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from importlib import resources
 from os import PathLike
 from pathlib import Path
 
 from sb3_dce.data.catalog import DatasetSpec, all_specs, resolve, spec_of_file
 from sb3_dce.data.minari import find_minari, is_minari_name
-from sb3_dce.errors import DatasetError, DatasetFormatError, DatasetNotFoundError
+from sb3_dce.errors import ConfigError, DatasetError, DatasetFormatError, DatasetNotFoundError
+from sb3_dce.files import expanded
 
 DATASETS_VARIABLE = "SB3_DCE_DATASETS"
 SUFFIXES = (".hdf5", ".h5", ".npz", ".csv", ".parquet")
@@ -35,7 +37,7 @@ def find_file(name_or_path: str | PathLike[str]) -> tuple[Path, DatasetSpec | No
     if is_minari_name(name_or_path):
         return find_minari(name_or_path).file, None
     if is_path(name_or_path):
-        path = Path(name_or_path).expanduser()
+        path = expanded(name_or_path)
         if not path.exists():
             raise DatasetNotFoundError("no such file", where=str(path), hint=_available_hint(), path=path)
         return path, spec_of_file(path)
@@ -84,7 +86,7 @@ def is_path(name_or_path: str | PathLike[str]) -> bool:
     if not isinstance(name_or_path, str) or name_or_path.endswith(SUFFIXES):
         return True
     has_separator = any(separator and separator in name_or_path for separator in (os.sep, os.altsep))
-    return has_separator or Path(name_or_path).expanduser().is_file()
+    return has_separator or os.path.isfile(expanded(name_or_path))
 
 
 def search(spec: DatasetSpec) -> Path | None:
@@ -97,7 +99,7 @@ def search(spec: DatasetSpec) -> Path | None:
     folders = [embedded_folder()] if spec.embedded else []
     names = dict.fromkeys((spec.file_name, f"{spec.id}.hdf5"))
     candidates = (folder / name for folder in [*folders, *search_folders()] for name in names)
-    return next((path for path in candidates if path.is_file()), None)
+    return next((path for path in candidates if os.path.isfile(path)), None)  # a folder that may not be read has none
 
 
 def require_file(path: str | PathLike[str]) -> Path:
@@ -143,9 +145,13 @@ def cache_folder() -> Path:
     Folder in which this package keeps datasets, ``~/.cache/sb3_dce/datasets`` or its place below ``$XDG_CACHE_HOME``.
 
     :return: folder, need not exist
+    :raises ConfigError: for a user without a home folder
     """
-    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(base).expanduser() / "sb3_dce" / "datasets"
+    base = expanded(os.environ.get("XDG_CACHE_HOME") or "~/.cache")
+    if base.parts[:1] == ("~",):
+        hint = f"Name a folder in $XDG_CACHE_HOME or ${DATASETS_VARIABLE}."
+        raise ConfigError("this user has no home folder in which datasets could be kept", key="HOME", hint=hint)
+    return base / "sb3_dce" / "datasets"
 
 
 def search_folders() -> list[Path]:
@@ -156,14 +162,15 @@ def search_folders() -> list[Path]:
     """
     own = os.environ.get(DATASETS_VARIABLE, "").split(os.pathsep)
     d4rl = os.environ.get("D4RL_DATASET_DIR", "")
-    folders = [*(Path(folder).expanduser() for folder in own if folder), cache_folder()]
-    if d4rl:
-        folders.append(Path(d4rl).expanduser())
-    return [*folders, Path("~/.d4rl/datasets").expanduser()]
+    folders = [expanded(folder) for folder in own if folder]
+    with suppress(ConfigError):
+        folders.append(cache_folder())
+    folders += [expanded(folder) for folder in (d4rl, "~/.d4rl/datasets") if folder]
+    return [folder for folder in folders if folder.parts[:1] != ("~",)]
 
 
 def _not_found(spec: DatasetSpec) -> DatasetNotFoundError:
-    target = search_folders()[0] / spec.file_name
+    target = next(iter(search_folders()), Path()) / spec.file_name
     here = available()
     stand_ins = [twin.id for twin, _ in here if twin.generated and twin.paper_row == spec.paper_row and twin != spec]
     hint = f"Put the file at {target}"

@@ -20,6 +20,7 @@ import numpy as np
 
 from sb3_dce.data.file_checks import translated_errors
 from sb3_dce.errors import ConfigError, DatasetError, DatasetFormatError, DatasetIntegrityError, DatasetNotFoundError
+from sb3_dce.files import expanded
 
 PREFIX = "minari:"
 ROOT_VARIABLE = "MINARI_DATASETS_PATH"
@@ -94,7 +95,7 @@ def dataset_folder(name: str) -> Path:
     :return: folder in which its data are looked for, need not exist
     """
     root = os.environ.get(ROOT_VARIABLE) or "~/.minari/datasets"
-    return Path(root).expanduser() / minari_id(name) / "data"
+    return expanded(root) / minari_id(name) / "data"
 
 
 def find_minari(name_or_path: str | PathLike[str]) -> MinariDataset:
@@ -135,7 +136,7 @@ def folder_of(path: str | PathLike[str]) -> Path | None:
     :param path: the folder with ``metadata.json``, the folder above it, ``metadata.json`` itself or ``main_data.hdf5``
     :return: folder with ``metadata.json``, None if the path is nothing of the kind
     """
-    path = Path(path).expanduser()
+    path = expanded(path)
     if path.name in (METADATA_FILE, HDF5_FILE):
         path = path.parent
     return next((folder for folder in (path, path / "data") if (folder / METADATA_FILE).is_file()), None)

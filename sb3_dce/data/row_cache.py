@@ -161,7 +161,7 @@ def _store(built: BuiltRows, entry: Path, key: Mapping[str, Any]) -> None:
 def _load(entry: Path, key: Mapping[str, Any], path: Path) -> BuiltRows | None:
     """The rows of an entry, None if it is not there or wrong."""
     matrix, facts = _files(entry)
-    if not facts.exists():
+    if not os.path.exists(facts):
         return None
     try:
         arrays = _read_facts(facts)

@@ -327,7 +327,7 @@ def _report(evidence: Evidence, out: Path, console: Console) -> Report:
     if evidence.left_out:
         console.print(f"  left out: {evidence.left_out} runs on another version of a file")
     folders = ", ".join(dict.fromkeys(f"{path.parent}/{experiment.id}*" for path in written))
-    console.print(f"saved  {folders}", markup=False)
+    console.print(f"saved  {folders}", markup=False, soft_wrap=True)
     return report
 
 

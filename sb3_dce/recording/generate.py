@@ -23,6 +23,7 @@ from sb3_dce.data.layout import CORE_KEYS
 from sb3_dce.data.locate import search_folders
 from sb3_dce.data.transitions import Transitions
 from sb3_dce.errors import ConfigError, DatasetError, DatasetNotFoundError
+from sb3_dce.files import expanded
 from sb3_dce.recording.episodes import Arrays, RecordingSpec
 from sb3_dce.recording.recorder import Recorded, check_target, describe, record, score_of
 
@@ -380,9 +381,7 @@ def _search(job: _Job) -> Path | None:
     :raises DatasetNotFoundError: if a folder was given and lacks it, or nothing else can be done
     """
     named = job.sources.policies
-    folders = (
-        [named] if named else [Path(f).expanduser() for f in os.environ.get(POLICIES_VARIABLE, "").split(os.pathsep) if f]
-    )
+    folders = [named] if named else [expanded(f) for f in os.environ.get(POLICIES_VARIABLE, "").split(os.pathsep) if f]
     name = job.recipe.file
     assert name is not None
     for folder in folders:

@@ -20,7 +20,7 @@ from gymnasium import spaces
 
 from sb3_dce.data.hashes import file_sha256
 from sb3_dce.errors import CheckpointError, ConfigError
-from sb3_dce.files import write_atomically
+from sb3_dce.files import expanded, write_atomically
 from sb3_dce.numpy_policy import (
     ACTIVATIONS,
     Layer,
@@ -79,7 +79,7 @@ def load_policy(
     :raises ConfigError: if it does not fit the environment, or a parameter is wrong
     :raises CheckpointError: if the file is missing, damaged or of an unknown kind
     """
-    path = Path(source).expanduser()
+    path = expanded(source)
     if path.suffix != ".zip" and (algo or vecnormalize):
         raise ConfigError(
             f"algo and vecnormalize belong to a zip file of Stable-Baselines3, the policy is {source!r}",
