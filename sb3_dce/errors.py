@@ -79,7 +79,7 @@ class DownloadError(SB3DCEError, OSError):
     """A dataset could not be downloaded."""
 
 
-class LockedError(SB3DCEError, OSError):
+class LockedError(SB3DCEError):
     """Another process is at the same file or folder and does not come to an end."""
 
 
