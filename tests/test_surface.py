@@ -33,7 +33,7 @@ from sb3_dce.evaluation import EvaluationCallback, evaluate
 from sb3_dce.population import Population
 from sb3_dce.rollouts import make_rollouts, rollouts_of
 from tests.commands import sb3_dce
-from tests.test_agents import AGENTS, Agent, make
+from tests.test_agents import AGENTS, COMMON_METRICS, Agent, make
 
 TINY = "halfcheetah-tiny-sb3"
 
@@ -214,6 +214,15 @@ def test_messages_speak_of_parameters_the_agent_has(transitions: Transitions) ->
         with pytest.warns(SB3DCEWarning, match="critics are diverging") as caught:
             model._warn_of_large_values({"q_data": 1e9})
         assert ("larger beta" in str(caught[0].message)) is named
+
+
+def test_every_logged_name_is_explained(agent: Agent) -> None:
+    docs = Path(__file__).parents[1] / "docs"
+    text = (docs / ("dce.md" if issubclass(agent.cls, OfflineDCE) else "agents.md")).read_text(encoding="utf-8")
+    section = text[text.index("## What is logged") :]
+    section = section[: section.index("\n## ", 5)]
+    missing = [name for name in f"{COMMON_METRICS} {agent.metrics}".split() if f"`{name}`" not in section]
+    assert missing == []
 
 
 # -- files -------------------------------------------------------------------------------------------------------------
