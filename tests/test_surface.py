@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import re
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from typing import Any
 import gymnasium as gym
 import h5py
 import numpy as np
+import pandas as pd
 import pytest
 import torch as th
 from gymnasium import spaces
@@ -385,3 +387,28 @@ def test_an_interrupted_population_keeps_what_it_has(transitions: Transitions, m
     other.train(3)
     for p, q in zip(models[0].policy.parameters(), other.models[0].policy.parameters(), strict=True):
         assert th.equal(p, q)
+
+
+# -- examples ----------------------------------------------------------------------------------------------------------
+
+
+def _examples() -> list[tuple[str, str]]:
+    root = Path(__file__).parents[1]
+    pages = [root / "README.md", *sorted((root / "docs").glob("*.md"))]
+    found = ((page.name, re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), re.S)) for page in pages)
+    return [
+        (name, block) for name, blocks in found for block in blocks if "import" in block
+    ]  # the others show one line of something else
+
+
+@pytest.mark.parametrize(("page", "code"), _examples(), ids=[f"{page}-{n}" for n, (page, _) in enumerate(_examples())])
+def test_examples_run_as_they_are_written(page: str, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorter, on fewer data, and with data that need no download."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    names = ["obs_0", "obs_1", "obs_2", "action_0", "reward"]
+    log = pd.DataFrame(rng.uniform(-1, 1, (300, 5)), columns=names).assign(terminal=0, timeout=[0, 0, 1] * 100)
+    log.to_csv("log.csv", index=False)
+    code = re.sub(r"learn\(1e\d", "learn(4", code).replace("train(1000)", "train(4)")
+    code = re.sub(r'"(walker2d-medium|halfcheetah-demo-sb3)"', f'"{TINY}"', code)
+    exec(compile(code, page, "exec"), {})
