@@ -8,9 +8,7 @@ callback keeps its meaning and an evaluation at step N sees exactly N updates.
 from __future__ import annotations
 
 import os
-import sys
 import time
-import warnings
 from contextlib import nullcontext
 from typing import Any, ClassVar, TypeVar
 
@@ -22,12 +20,13 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_dce.attaching import AttachingMixin, DatasetLike
+from sb3_dce.attaching import DatasetLike
 from sb3_dce.buffers import OfflineReplayBuffer
 from sb3_dce.checks import check_choice, check_number, check_seed, check_steps
+from sb3_dce.diagnostics import RECORDED, DiagnosticsMixin
 from sb3_dce.envs import SpacesEnv
-from sb3_dce.errors import ConfigError, SB3DCEWarning
-from sb3_dce.execution import EXECUTIONS, Engine, Update, choose_execution, refuse_divergence
+from sb3_dce.errors import ConfigError
+from sb3_dce.execution import EXECUTIONS, Engine, Update, choose_execution
 from sb3_dce.hyperparams import constructor_parameters
 from sb3_dce.networks import StandardizedExtractor
 from sb3_dce.noise import NoiseSpec
@@ -49,11 +48,9 @@ SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
 
 # Metrics are read back at least this often (updates), so that a divergence is noticed even without logging.
 GUARD_INTERVAL = 1000
-# There as soon as a row of the log has its diagnostics.
-RECORDED = "train/n_updates"
 
 
-class OfflineAlgorithm(AttachingMixin, SavingMixin):
+class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
     """
     Base of the offline agents. A subclass states its update and its networks; everything else is here, once.
 
@@ -240,13 +237,6 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
         :return: arguments of the policy that follow from the agent's own parameters
         """
         return {"features_extractor_class": StandardizedExtractor} if self.normalize_obs else {}
-
-    def derived_metrics(self, means: dict[str, float]) -> dict[str, float]:
-        """
-        :param means: metrics of the last interval
-        :return: further ones computed from them
-        """
-        return {}
 
     def check_parameters(self) -> None:
         """
@@ -521,63 +511,3 @@ class OfflineAlgorithm(AttachingMixin, SavingMixin):
                     self.dump_logs()
         del new_obs, infos, rewards, dones
         return keep_going
-
-    def _refuse_divergence(self) -> None:
-        if self._engine is not None:
-            refuse_divergence(self._engine.metrics.read(clear=False), self._metrics_read_at[1], self._n_updates)
-
-    def read_metrics(self) -> dict[str, float]:
-        """
-        Mean of every diagnostic since the last call, read from the device.
-
-        :return: name -> value, the names of the log without ``train/``; empty before the first update
-        :raises DivergenceError: if one is not finite
-        """
-        if self._engine is None:
-            return {}
-        means = self._engine.metrics.read()
-        then, updates_then = self._metrics_read_at
-        refuse_divergence(means, updates_then, self._n_updates)
-        if not means:
-            return {}
-        now = time.time_ns()
-        seconds = max((now - then) / 1e9, sys.float_info.epsilon)
-        means["sec_per_1000"] = 1000.0 * seconds / max(self._n_updates - updates_then, 1)
-        self._metrics_read_at = (now, self._n_updates)
-        return {**means, **self.derived_metrics(means)}
-
-    def _record_metrics(self) -> None:
-        metrics = self.read_metrics()
-        for name, value in metrics.items():
-            self.logger.record(f"train/{name}", value)
-        self.logger.record("train/learning_rate", self.lr_schedule(self._current_progress_remaining))
-        self.logger.record(RECORDED, self._n_updates, exclude="tensorboard")
-        self._warn_of_large_values(metrics)
-
-    def _warn_of_large_values(self, metrics: dict[str, float]) -> None:
-        if self._warned_large_q or self.dataset_statistics is None or self.gamma >= 1.0:
-            return
-        largest = self._reward_factor() * self.dataset_statistics["reward_abs_max"] + abs(self.reward_shift)
-        bound = 10.0 * largest / (1.0 - self.gamma)
-        if abs(metrics.get("q_data", 0.0)) > bound:
-            self._warned_large_q = True
-            warnings.warn(
-                f"mean Q on the data is {metrics['q_data']:.3g} after {self._n_updates} updates, beyond 10 times the largest "
-                f"return the rewards allow ({bound:.3g}): the critics are diverging. Try a smaller "
-                f"learning_rate{' or a larger beta' if hasattr(self, 'beta') else ''}.",
-                SB3DCEWarning,
-            )
-
-    def dump_logs(self) -> None:
-        """Write one log row: diagnostics since the last, gradient steps per second, elapsed seconds, timesteps."""
-        if RECORDED not in self.logger.name_to_value:
-            self._record_metrics()
-        self._record_time()
-        self.logger.dump(step=self.num_timesteps)
-
-    def _record_time(self) -> None:
-        elapsed = max((time.time_ns() - self.start_time) / 1e9, sys.float_info.epsilon)
-        fps = int((self.num_timesteps - self._num_timesteps_at_start) / elapsed)
-        self.logger.record("time/fps", fps)
-        self.logger.record("time/time_elapsed", int(elapsed), exclude="tensorboard")
-        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
