@@ -23,7 +23,6 @@ from update_tools import (
     all_tensors,
     check_changes_nothing_in_place,
     check_compiled_equals_eager,
-    check_many_at_once_equal_single_runs,
     largest_difference,
     needs_compiler,
     record_steps,
@@ -328,11 +327,6 @@ def test_compiled_update_equals_the_eager_one(transitions: Transitions) -> None:
     assert len(compiled._engine._compiled) == 1, "a changed beta is no reason to compile again"
     # 2, 1.75, 1.5, 1.25, 1: ten updates each
     assert metrics["beta"] == pytest.approx(1.5, abs=1e-12)
-
-
-def test_three_models_at_once_equal_three_single_runs(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
-    models = [make_model(transitions, seed=seed) for seed in range(3)]
-    assert check_many_at_once_equal_single_runs(models, monkeypatch)["q_data"].shape == (3,)
 
 
 def test_update_changes_nothing_in_place(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,6 @@ from update_tools import (
     all_tensors,
     check_changes_nothing_in_place,
     check_compiled_equals_eager,
-    check_many_at_once_equal_single_runs,
     largest_difference,
     needs_compiler,
     record_steps,
@@ -86,14 +85,6 @@ def test_compiled_update_equals_the_eager_one(transitions: Transitions) -> None:
     check_compiled_equals_eager(
         lambda **kwargs: make_model(transitions, bc_loss="nll", policy_kwargs={"net_arch": [8]}, **kwargs)
     )
-
-
-@pytest.mark.parametrize("bc_loss", ["mse", "nll"])
-def test_three_models_at_once_equal_three_single_runs(
-    bc_loss: str, transitions: Transitions, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    models = [make_model(transitions, seed=seed, bc_loss=bc_loss) for seed in range(3)]
-    assert check_many_at_once_equal_single_runs(models, monkeypatch)["bc_loss"].shape == (3,)
 
 
 @pytest.mark.parametrize("bc_loss", ["mse", "nll"])

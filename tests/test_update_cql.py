@@ -20,7 +20,6 @@ from update_tools import (
     all_tensors,
     check_changes_nothing_in_place,
     check_compiled_equals_eager,
-    check_many_at_once_equal_single_runs,
     largest_difference,
     needs_compiler,
     record_steps,
@@ -257,15 +256,6 @@ def test_update_with_rounded_products_is_compiled(transitions: Transitions, monk
     model = make_model(transitions, **settings)
     model.train(2, BATCH)
     assert model._engine.execution == "compile", "not fallen back to eager"
-
-
-@pytest.mark.parametrize("clone", [False, True])
-def test_three_models_at_once_equal_three_single_runs(
-    clone: bool, transitions: Transitions, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    kwargs = {"lagrange_threshold": 5.0, "policy_eval_start": 100 * clone}
-    models = [make_model(transitions, seed=seed, **kwargs) for seed in range(3)]
-    assert check_many_at_once_equal_single_runs(models, monkeypatch, 10)["q_data"].shape == (3,)
 
 
 def test_update_changes_nothing_in_place(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,6 @@ from update_tools import (
     all_tensors,
     check_changes_nothing_in_place,
     check_compiled_equals_eager,
-    check_many_at_once_equal_single_runs,
     largest_difference,
     needs_compiler,
     record_steps,
@@ -189,11 +188,6 @@ def test_compiled_update_equals_the_eager_one(transitions: Transitions) -> None:
     check_compiled_equals_eager(
         lambda **kwargs: make_model(transitions, actor_dropout=0.1, policy_kwargs={"net_arch": [8]}, **kwargs)
     )
-
-
-def test_three_models_at_once_equal_three_single_runs(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
-    models = [make_model(transitions, seed=seed, actor_dropout=0.1) for seed in range(3)]
-    assert check_many_at_once_equal_single_runs(models, monkeypatch)["weight"].shape == (3,)
 
 
 def test_update_changes_nothing_in_place(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:

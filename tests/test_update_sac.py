@@ -17,7 +17,6 @@ from update_tools import (
     all_tensors,
     check_changes_nothing_in_place,
     check_compiled_equals_eager,
-    check_many_at_once_equal_single_runs,
     largest_difference,
     needs_compiler,
     record_steps,
@@ -162,14 +161,6 @@ def test_max_grad_norm_clips_every_network(transitions: Transitions) -> None:
 @needs_compiler
 def test_compiled_update_equals_the_eager_one(transitions: Transitions) -> None:
     check_compiled_equals_eager(lambda **kwargs: make_model(transitions, policy_kwargs={"net_arch": [8]}, **kwargs))
-
-
-@pytest.mark.parametrize("ent_coef", ["auto", 0.2])
-def test_three_models_at_once_equal_three_single_runs(
-    ent_coef: str | float, transitions: Transitions, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    models = [make_model(transitions, seed=seed, ent_coef=ent_coef) for seed in range(3)]
-    assert check_many_at_once_equal_single_runs(models, monkeypatch)["q_data"].shape == (3,)
 
 
 def test_update_changes_nothing_in_place(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,6 @@ from update_tools import (
     all_tensors,
     check_changes_nothing_in_place,
     check_compiled_equals_eager,
-    check_many_at_once_equal_single_runs,
     largest_difference,
     needs_compiler,
     record_steps,
@@ -167,11 +166,6 @@ def test_compiled_update_equals_the_eager_one(transitions: Transitions) -> None:
         lambda **kwargs: make_model(transitions, policy_kwargs={"net_arch": [8]}, **kwargs)
     )
     assert len(compiled._engine._compiled) == 2, "with and without actor, and no more"
-
-
-def test_three_models_at_once_equal_three_single_runs(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
-    models = [make_model(transitions, seed=seed, policy_update_freq=1) for seed in range(3)]
-    assert check_many_at_once_equal_single_runs(models, monkeypatch)["lambda"].shape == (3,)
 
 
 @pytest.mark.parametrize("policy_update_freq", [1, 2], ids=["with actor", "without actor"])

@@ -23,7 +23,6 @@ from update_tools import (
     all_tensors,
     check_changes_nothing_in_place,
     check_compiled_equals_eager,
-    check_many_at_once_equal_single_runs,
     largest_difference,
     needs_compiler,
     record_steps,
@@ -334,11 +333,6 @@ def test_compiled_update_equals_the_eager_one(transitions: Transitions) -> None:
 def test_warm_start_is_compiled_once_and_the_rest_once(transitions: Transitions) -> None:
     compiled, _ = compiled_and_eager(transitions, policy_eval_start=20)
     assert len(compiled._engine._compiled) == 2
-
-
-def test_three_models_at_once_equal_three_single_runs(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
-    models = [make_model(transitions, seed=seed) for seed in range(3)]
-    assert check_many_at_once_equal_single_runs(models, monkeypatch)["q_policy"].shape == (3,)
 
 
 @pytest.mark.parametrize("policy_eval_start", [0, 10])
