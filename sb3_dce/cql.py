@@ -23,7 +23,7 @@ from sb3_dce.networks import OfflineCritic
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import OfflineSACPolicy
 from sb3_dce.state import PureNet, Storage
-from sb3_dce.steps import descend, polyak, q_data_metrics
+from sb3_dce.steps import action_metrics, descend, polyak, q_data_metrics
 
 LAGRANGE = "log_lagrange"  # name of the multiplier's learner in the state tree
 LAGRANGE_FORMS = ("weighted_gap", "gap")
@@ -332,8 +332,7 @@ def update(
     rate = coef["actor_learning_rate"]
     new["actor"], loss, _, norm = descend(pi_loss, state["actor"], rate, settings["actor"], clip)
     metrics.update(actor_loss=loss, grad_norm_actor=norm, entropy=-log_prob.mean(), ent_coef=ent_coef.mean())
-    metrics.update(bc_loss=losses.bc_nll(mean, log_std, a), action_dist=(a_pi - a).abs().mean())
-    metrics["action_sat"] = (a_pi.abs() > 0.99).to(a_pi.dtype).mean()
+    metrics.update(bc_loss=losses.bc_nll(mean, log_std, a), **action_metrics(a_pi, a))
 
     # 6 targets
     new["critic_target"] = polyak(new["critic"].params, state["critic_target"], coef["tau"])

@@ -23,7 +23,7 @@ from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import OfflineSACPolicy
 from sb3_dce.schedules import StepSchedule
 from sb3_dce.state import PureNet, Storage
-from sb3_dce.steps import Forward, descend, descend_from, polyak, q_data_metrics
+from sb3_dce.steps import Forward, action_metrics, descend, descend_from, polyak, q_data_metrics
 from sb3_dce.theory import beta_eff, shift_factor
 
 PENALTY_SOURCES = ("policy", "policy_deterministic", "next_policy", "dataset", "uniform")
@@ -451,8 +451,7 @@ def update(
         new["value_net_target"] = polyak(new["value_net"].params, state["value_net_target"], coef["tau"])
 
     # 4 and 5 temperature and actor; alpha is the value before the temperature's step, as in Stable-Baselines3
-    metrics["action_dist"] = (a_pi - a).abs().mean()
-    metrics["action_sat"] = (a_pi.abs() > 0.99).to(a_pi.dtype).mean()
+    metrics.update(action_metrics(a_pi, a))
     if not with_actor:
         return new, metrics
     ent_coef = state[ENT_COEF].params.exp() if options.learned_ent_coef else coef["ent_coef"]

@@ -117,7 +117,7 @@ class OfflineCritic(KeepDtype, ContinuousCritic):
                     activation_fn,
                     post_linear_modules=[nn.LayerNorm],
                 )
-                # Also on the output SB3 would put nothing; create_mlp leaves the last layer bare as we want.
+                # Critics of Stable-Baselines3 take no such modules, so the networks are made again; the output stays bare.
                 q_net = nn.Sequential(*layers)
                 setattr(self, f"qf{index}", q_net)
                 self.q_networks.append(q_net)

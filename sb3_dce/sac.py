@@ -19,7 +19,7 @@ from sb3_dce.networks import OfflineCritic
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import OfflineSACPolicy
 from sb3_dce.state import PureNet, Storage
-from sb3_dce.steps import descend, polyak, q_data_metrics
+from sb3_dce.steps import action_metrics, descend, polyak, q_data_metrics
 
 
 class OfflineSAC(EntropyCoefficient, OfflineAlgorithm):
@@ -182,7 +182,7 @@ def update(
     actions, log_prob, q_pi = kept
     metrics.update(actor_loss=loss, grad_norm_actor=norm, entropy=-log_prob.mean(), ent_coef=ent_coef.mean())
     metrics.update(q_policy=q_pi.mean(), q_gap=q_pi.mean() - q_data.mean())
-    metrics.update(action_dist=(actions - a).abs().mean(), action_sat=(actions.abs() > 0.99).to(a.dtype).mean())
+    metrics.update(action_metrics(actions, a))
 
     # 4 temperature, from the log-probability of the policy before its step
     if learned:

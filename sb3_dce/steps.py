@@ -144,3 +144,13 @@ def q_data_metrics(q_values: th.Tensor) -> dict[str, th.Tensor]:
     """
     names = ("q_data", "q_data_std", "q_data_min", "q_data_max")
     return dict(zip(names, (q_values.mean(), q_values.std(), q_values.min(), q_values.max()), strict=True))
+
+
+def action_metrics(actions: th.Tensor, data_actions: th.Tensor) -> dict[str, th.Tensor]:
+    """
+    :param actions: of the policy, scaled to [-1, 1], shape (batch, action_dim)
+    :param data_actions: of the data in the same states, same shape
+    :return: how far they are apart, and the share of the policy's that lie at their bounds
+    """
+    saturated = (actions.abs() > 0.99).to(actions.dtype)
+    return {"action_dist": (actions - data_actions).abs().mean(), "action_sat": saturated.mean()}

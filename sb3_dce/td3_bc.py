@@ -19,7 +19,7 @@ from sb3_dce.networks import OfflineCritic
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import OfflineTD3Policy
 from sb3_dce.state import PureNet, Storage
-from sb3_dce.steps import descend, polyak, q_data_metrics
+from sb3_dce.steps import action_metrics, descend, polyak, q_data_metrics
 
 
 class OfflineTD3BC(OfflineAlgorithm):
@@ -211,7 +211,7 @@ def update(
     metrics.update(actor_loss=loss, grad_norm_actor=norm, bc_loss=losses.bc_mse(actions, a))
     metrics["lambda"] = losses.td3bc_lambda(q_pi, coef["alpha"])
     metrics.update(q_policy=q_pi.mean(), q_gap=q_pi.mean() - q_data.mean())
-    metrics.update(action_dist=(actions - a).abs().mean(), action_sat=(actions.abs() > 0.99).to(a.dtype).mean())
+    metrics.update(action_metrics(actions, a))
 
     # 4 targets
     for name in ("critic", "actor"):

@@ -18,7 +18,7 @@ from sb3_dce.checks import check_choice, check_number, check_optional, check_wid
 from sb3_dce.execution import Update
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.state import PureNet, Storage
-from sb3_dce.steps import descend, polyak, q_data_metrics
+from sb3_dce.steps import action_metrics, descend, polyak, q_data_metrics
 from sb3_dce.uwac_networks import ActionVAE, DropoutCritic
 from sb3_dce.uwac_policy import VAE_NET_ARCH, UWACPolicy
 
@@ -372,7 +372,7 @@ def update(
     rate = coef["actor_learning_rate"]
     new["actor"], loss, (mmd, a_pi, log_prob, *q_kept), norm = descend(pi_loss, state["actor"], rate, settings["actor"], clip)
     metrics.update(actor_loss=loss, grad_norm_actor=norm, mmd=mmd.mean(), alpha=alpha.mean(), entropy=-log_prob.mean())
-    metrics.update(action_dist=(a_pi - a).abs().mean(), action_sat=(a_pi.abs() > 0.99).to(a_pi.dtype).mean())
+    metrics.update(action_metrics(a_pi, a))
     if not mmd_only:
         q_pi, variances = q_kept
         metrics.update(q_policy=q_pi, q_gap=q_pi - q_data.mean(), policy_variance=variances.mean())

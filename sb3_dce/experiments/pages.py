@@ -1,4 +1,4 @@
-"""The results page, Markdown, from the reports of all experiments; nothing on it is typed by hand."""
+"""The results page, Markdown, from the reports of all experiments; no number of ours is typed by hand."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def write_page(path: Path, out: Path, evidences: Mapping[str, Evidence], reports
     every = [verdict for found in judged.values() for verdict in found]
     parts = [
         "# Results",
-        f"Made from the result rows in `{link}rows/` by `{command}`; nothing here is typed by hand.",
+        f"Made from the result rows in `{link}rows/` by `{command}`; no number of ours is typed by hand.",
         "Data whose names end in `-sb3` are made with this package. They stand in for D4RL's sets and are not these: scores "
         "on them cannot be compared with published ones, which stand beside them in columns of their own, under the D4RL id "
         "they belong to. Scores are those of the last policy, with D4RL's constants, in the version 4 environments.",
