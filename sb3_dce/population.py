@@ -271,6 +271,14 @@ class Population:
         return {"data": self._rows.numel() * self._rows.element_size(), "networks": state, "update": 2 * state}
 
 
+def free_parameters(cls: type[OfflineAlgorithm]) -> frozenset[str]:
+    """
+    :param cls: agent
+    :return: parameters in which the members of a population may differ
+    """
+    return SCALARS.union(*(getattr(base, "population_scalars", ()) for base in cls.__mro__))
+
+
 def check_alike(models: Sequence[OfflineAlgorithm]) -> None:
     """
     :param models: candidates for a population
@@ -282,8 +290,7 @@ def check_alike(models: Sequence[OfflineAlgorithm]) -> None:
         hint = "Set normalize_obs=True instead, whose statistics stay in each model."
         raise ConfigError("members of a population cannot have a VecNormalize", key="env", hint=hint)
     first = models[0]
-    own = (getattr(base, "population_scalars", ()) for base in type(first).__mro__)
-    allowed = SCALARS.union(*own)
+    allowed = free_parameters(type(first))
     differing: str
     theirs: Any
     ours: Any

@@ -15,7 +15,7 @@ from torch.utils._pytree import tree_leaves
 from sb3_dce import Transitions
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.errors import ConfigError
-from sb3_dce.population import SCALARS, Population
+from sb3_dce.population import Population, free_parameters
 
 # Numbers of every agent, and those of each; a member differs from the first one in a single one of them.
 COMMON = {
@@ -69,8 +69,7 @@ def float64() -> Iterator[None]:
 
 def allowed(cls: type[OfflineAlgorithm]) -> set[str]:
     """Parameters of a class in which members may differ."""
-    own = SCALARS.union(*(getattr(base, "population_scalars", ()) for base in cls.__mro__))
-    return own & set(inspect.signature(cls).parameters)
+    return free_parameters(cls) & set(inspect.signature(cls).parameters)
 
 
 def make(name: str, data: Transitions, **kwargs: Any) -> OfflineAlgorithm:

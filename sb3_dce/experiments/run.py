@@ -21,7 +21,7 @@ from sb3_dce.experiments.configuration import row_of
 from sb3_dce.experiments.grid import PlannedRun
 from sb3_dce.experiments.probe import prepare_probe
 from sb3_dce.launch import launch_all
-from sb3_dce.population import SCALARS
+from sb3_dce.population import free_parameters
 from sb3_dce.population_runs import train_population
 from sb3_dce.runs import RunSpec, read_divergence, read_result
 
@@ -121,7 +121,7 @@ def populations(specs: Iterable[RunSpec]) -> list[list[RunSpec]]:
     groups: dict[Any, list[RunSpec]] = {}
     for spec in specs:
         cls, data = agent_class(spec.algo), resolve(spec.dataset)
-        free = SCALARS.union(*(getattr(base, "population_scalars", ()) for base in cls.__mro__))
+        free = free_parameters(cls)
         settings = {**row_of(spec.algo, data.id), **spec.overrides}
         fixed = {k: v for k, v in settings.items() if k not in free}
         shape = (data.obs_dim, data.act_dim)
