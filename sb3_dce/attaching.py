@@ -18,7 +18,6 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dce import hyperparams
 from sb3_dce.buffers import OfflineReplayBuffer
@@ -30,6 +29,7 @@ from sb3_dce.envs import SpacesEnv, dataset_spaces, make_env_if_possible, own_en
 from sb3_dce.errors import ConfigError, DatasetIntegrityError, DatasetSemanticsError, DatasetWarning, SB3DCEWarning
 from sb3_dce.networks import StandardizedExtractor
 from sb3_dce.normalizing import FEWEST_OBSERVATIONS, is_untouched, vec_normalize_of
+from sb3_dce.sb3_checks import check_env_fits
 
 DatasetLike = str | os.PathLike[str] | Transitions
 SelfAttaching = TypeVar("SelfAttaching", bound="AttachingMixin")
@@ -92,38 +92,29 @@ class AttachingMixin(OffPolicyAlgorithm):
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """
-        Evaluate in another environment.
+        Evaluate in another environment, whose bounds of observations the model takes over.
 
-        Spaces that were taken from the data know no bounds of observations; they become those of the environment.
-
-        :param env: environment with observations of the same shape, and with the actions of the model
+        :param env: one environment, with observations of the same shape and with the actions of the model
         :param force_reset: kept for Stable-Baselines3
-        :raises ConfigError: if its spaces are others
+        :raises ConfigError: if its spaces are others, or it consists of several
         """
+        without_simulator = isinstance(env, SpacesEnv)
         env = self._wrap_env(env, self.verbose)
-        self._take_spaces_of(env)
+        if env.num_envs != 1:
+            hint = "Give one; evaluate_policy(model, vec_env) and EvalCallback(vec_env) take several."
+            raise ConfigError(f"the model wants one environment, got {env.num_envs} in one", key="env", hint=hint)
+        hint = "Use an environment with the spaces of the data, or read the data with its bounds (action_scale=)."
+        check_env_fits(self, env, hint)
+        for owner in (self, getattr(self, "policy", None)):
+            if owner is not None:
+                owner.observation_space, owner.action_space = env.observation_space, env.action_space
         super().set_env(env, force_reset)
-        self.warn_without_statistics()
-
-    def warn_without_statistics(self) -> None:
-        """Say it where ``predict`` would see other observations than in training; training and our evaluation refuse."""
+        if without_simulator:
+            return
         try:
             vec_normalize_of(self)
         except ConfigError as error:
             warnings.warn(str(error), SB3DCEWarning)
-
-    def _take_spaces_of(self, env: VecEnv) -> None:
-        for name, what in (("observation_space", "observations"), ("action_space", "actions")):
-            own, theirs = getattr(self, name), getattr(env, name)
-            fits = isinstance(theirs, spaces.Box) and theirs.shape == own.shape
-            if fits and not (name == "observation_space" and np.isinf(own.low).all() and np.isinf(own.high).all()):
-                fits = np.array_equal(own.low, theirs.low) and np.array_equal(own.high, theirs.high)
-            if not fits:
-                hint = "Use an environment with the spaces of the data, or read the data with its bounds (action_scale=)."
-                text = f"the {what} of the environment are {theirs}, those of the model {own}"
-                raise ConfigError(text, key="env", hint=hint)
-        for owner in (self, self.policy):
-            owner.observation_space, owner.action_space = env.observation_space, env.action_space
 
     def set_dataset(self, dataset: DatasetLike) -> None:
         """
@@ -142,7 +133,9 @@ class AttachingMixin(OffPolicyAlgorithm):
         :param path: file
         """
         if self.dataset is not None:
-            size = self._own_buffer().size() * (2 * int(np.prod(self.observation_space.shape or ())) + 8) * 4 / 1e6
+            self.attach_dataset()
+            rows = self._own_buffer().rows
+            size = 0.0 if rows is None else rows.nbytes / 1e6
             text = f"the replay buffer ({size:,.0f} MB) is a copy of {self.dataset}, which a loaded model reads by itself"
             warnings.warn(text, DatasetWarning)
         super().save_replay_buffer(path)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 import shutil
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from sb3_dce.envs import dataset_spaces
 from sb3_dce.errors import ConfigError
 from sb3_dce.evaluation import read_evaluations
 from sb3_dce.execution import choose_execution
-from sb3_dce.files import write_text
+from sb3_dce.files import quoted, write_text
 from sb3_dce.launch import launch
 from sb3_dce.plots import plot_learning_curves
 from sb3_dce.processes import usable_cores
@@ -94,7 +93,7 @@ def run_demo(folder: Path, n_seeds: int, fresh: bool, console: Console) -> dict[
     )
     plot = picture.name if picture else "(no plot: pip install matplotlib)"
     console.print(f"       {folder}/results.json  {plot}", markup=False, soft_wrap=True)
-    model = shlex.quote(f"{folder}/dce_0/model.zip")
+    model = quoted(f"{folder}/dce_0/model.zip")
     console.print(f"next   sb3-dce evaluate {model}", markup=False, soft_wrap=True)
     return table
 

@@ -30,6 +30,7 @@ from sb3_dce.data.hdf5 import D4RLFile
 from sb3_dce.data.locate import known_dataset
 from sb3_dce.data.minari import environment_spec, find_minari, is_minari_name
 from sb3_dce.errors import ConfigError
+from sb3_dce.files import expanded
 from sb3_dce.robotics import KITCHEN_ROBOT_NOISE_RATIO, KitchenObservation, fix_adroit, fix_kitchen_joint_types, kitchen_tasks
 
 # the release of Gymnasium all scores were made with
@@ -168,7 +169,8 @@ def own_env(name_or_path: str) -> gym.Env | None:
     """
     if is_minari_name(name_or_path):
         return make_minari_env(name_or_path)
-    return make_recorded_env(name_or_path) if os.path.isfile(name_or_path) else None
+    path = expanded(name_or_path)
+    return make_recorded_env(path) if os.path.isfile(path) else None
 
 
 def make_minari_env(name: str) -> gym.Env | None:
@@ -245,19 +247,24 @@ def make_recorded_env(path: str | PathLike[str]) -> gym.Env | None:
     Environment of a file that this package has recorded: the one that Gymnasium itself knows by the id in its attributes.
 
     :param path: file of a dataset
-    :return: an environment that can be stepped, or ``None``
+    :return: an environment that can be stepped, or ``None``; also if the file is none of ours, or has rows of other widths
     """
     with open(path, "rb") as opened:
         if opened.read(len(HDF5_SIGNATURE)) != HDF5_SIGNATURE:
             return None
     with D4RLFile(path) as file:
-        env_id = file.attributes().get("env_id")
+        attributes, arrays = file.attributes(), file.select(("observations", "actions"))
+        widths = [int(np.prod(array.shape[1:])) for array in arrays.values()]
+    env_id = attributes.get("env_id") if attributes.get("generated") else None
     if not isinstance(env_id, str) or ":" in env_id:  # module:EnvId would import, and so run, what the file names
         return None
     try:
-        return make_env(env_id)
+        env = make_env(env_id)
     except ConfigError:
         return None
+    both = (env.observation_space, env.action_space)
+    fits = all(isinstance(space, spaces.Box) for space in both) and [int(np.prod(s.shape or ())) for s in both] == widths
+    return env if fits else None
 
 
 def missing_simulator(spec: DatasetSpec) -> MissingSimulator | None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import sys
 import sysconfig
 import warnings
 from collections.abc import Callable, Hashable, Iterator
@@ -72,7 +73,8 @@ def choose_execution(execution: str, planned_updates: int, device: th.device) ->
 def _has_compiler() -> bool:
     """Also whether the headers of Python are there, which some systems keep in a package of their own."""
     headers = (Path(sysconfig.get_path("include")) / "Python.h").is_file()
-    return headers and any(shutil.which(name) for name in ("g++", "clang++", "c++", "cl"))
+    needed = sys.platform.startswith("linux")  # elsewhere PyTorch looks in further places
+    return (headers or not needed) and any(shutil.which(name) for name in ("g++", "clang++", "c++", "cl"))
 
 
 def _cause(error: Exception) -> str:

@@ -6,6 +6,8 @@ import contextlib
 import glob
 import os
 import pathlib
+import shlex
+import subprocess
 import tempfile
 import time
 from collections.abc import Iterator
@@ -109,6 +111,14 @@ def expanded(path: str | PathLike[str]) -> pathlib.Path:
         return pathlib.Path(path).expanduser()
     except RuntimeError:
         return pathlib.Path(path)
+
+
+def quoted(path: str | PathLike[str]) -> str:
+    """
+    :param path: file
+    :return: as it is typed on a command line of this system
+    """
+    return subprocess.list2cmdline([str(path)]) if os.name == "nt" else shlex.quote(str(path))
 
 
 def check_writable(target: pathlib.Path) -> None:

@@ -127,9 +127,10 @@ class Population:
         :param n_updates: updates of each
         :param total_updates: updates of the whole run, over which learning rates may fall, and which decide whether
             compiling pays; default: those completed and these
-        :raises ConfigError: if ``n_updates`` is no whole number from 0 up
+        :raises ConfigError: if ``n_updates`` is no whole number from 0 up, or a member was trained or loaded by itself since
         """
         n_updates, first, before = check_steps("n_updates", n_updates), self.models[0], self._n_updates
+        self._refuse_replaced()
         total = self._n_updates + n_updates if total_updates is None else total_updates
         for model in self.models:
             model.policy.set_training_mode(True)
@@ -159,6 +160,16 @@ class Population:
                 model._n_updates = self._n_updates
                 model.num_timesteps += self._n_updates - before
             self.commit()
+
+    def _refuse_replaced(self) -> None:
+        """What was written into other tensors would be lost."""
+        for index, (model, storages) in enumerate(zip(self.models, self._storages, strict=True)):
+            if model._n_updates != self._n_updates or not all(storage.is_bound() for storage in storages.values()):
+                raise ConfigError(
+                    f"member {index} was trained, loaded or moved by itself, so it is no part of this population any more",
+                    key="models",
+                    hint="Make a new Population of the models; it goes on from what they are.",
+                )
 
     def _bound_engine(self, planned_updates: int) -> Engine[StackedState]:
         if self._engine is None:

@@ -22,10 +22,10 @@ from sb3_dce.data.catalog import resolve
 from sb3_dce.data.locate import catalogue_id, is_path
 from sb3_dce.data.minari import is_minari_name
 from sb3_dce.envs import make_env_if_possible, missing_simulator, own_env, without_bookkeeping
-from sb3_dce.errors import ConfigError
 from sb3_dce.locomotion import EnvSteps, fast_steps
 from sb3_dce.mlp_actor import MLPActor, actor_snapshot
 from sb3_dce.normalizing import vec_normalize_of
+from sb3_dce.sb3_checks import check_env_fits
 
 Act = Callable[[np.ndarray], np.ndarray]
 
@@ -104,16 +104,8 @@ class Rollouts:
         :param model: agent, or anything with ``predict``
         :raises ConfigError: if it sees or does other things than the environments have
         """
-        env = self._env(0)
-        for name, what in (("observation_space", "observations"), ("action_space", "actions")):
-            own, theirs = getattr(model, name, None), getattr(env, name)
-            if own is not None and own.shape != theirs.shape:
-                raise ConfigError(
-                    f"the model has {what} of shape {own.shape}, the environment to evaluate in of {theirs.shape}",
-                    where=self.dataset,
-                    key="dataset",
-                    hint="Name a dataset of the model's own environment, or use evaluate_policy(model, env) with it.",
-                )
+        hint = "Evaluate it in the environment of its own data (--dataset, --env), or use evaluate_policy(model, env)."
+        check_env_fits(model, self._env(0), hint)
 
     def play(self, act: Act, seed: int) -> Episodes:
         """

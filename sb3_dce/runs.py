@@ -28,7 +28,7 @@ from sb3_dce.agents import agent_class
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.data import find_file
 from sb3_dce.data.hashes import sha256_once
-from sb3_dce.data.locate import catalogue_id
+from sb3_dce.data.locate import catalogue_id, short_name
 from sb3_dce.data.locking import held
 from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError
 from sb3_dce.evaluation import Evaluation, EvaluationCallback, write_evaluations
@@ -168,7 +168,8 @@ def _train(spec: RunSpec, model: OfflineAlgorithm, folder: Path, report: Report)
     write_config(spec, model, folder)
     formats = [make_output_format("csv", str(folder), f"_{model.num_timesteps}")]
     if model.tensorboard_log is not None:
-        formats.append(make_output_format("tensorboard", str(Path(model.tensorboard_log) / f"{spec.algo}_{spec.seed}")))
+        name = f"{spec.algo}_{short_name(spec.dataset)}_{spec.seed}"
+        formats.append(make_output_format("tensorboard", str(Path(model.tensorboard_log) / name)))
     model.set_logger(Logger(str(folder), formats))
 
     def on_evaluation(outcome: Evaluation) -> None:

@@ -135,8 +135,6 @@ class SavingMixin(OffPolicyAlgorithm):
             raise CheckpointError(what, where=_name_of(source), hint=hint) from error
         if env is not None:
             model.set_env(env, force_reset)
-        else:
-            model.warn_without_statistics()  # type: ignore[attr-defined]  # AttachingMixin has it
         if not isinstance(model.dataset, str | None):
             raise CheckpointError(f"its dataset is {model.dataset!r}", where=_name_of(source), hint=DAMAGED)
         _refuse_not_finite(model, CheckpointError, f"{_name_of(source)} cannot be used")

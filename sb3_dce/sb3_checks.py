@@ -163,6 +163,26 @@ def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Spac
         raise ConfigError(f"actions must have finite bounds, got {action_space}", key="env", hint=hint)
 
 
+def check_env_fits(model: Any, env: Any, hint: str) -> None:
+    """
+    Bounds of observations are not looked at: networks do not know them, and data of one's own have none.
+
+    :param model: anything with spaces
+    :param env: environment it is to act in
+    :param hint: what to do
+    :raises ConfigError: if it sees observations of another shape, or does other actions
+    """
+    for name, what in (("observation_space", "observations"), ("action_space", "actions")):
+        own, theirs = getattr(model, name, None), getattr(env, name)
+        if own is None:
+            continue
+        fits = isinstance(theirs, type(own)) and theirs.shape == own.shape
+        if fits and name == "action_space" and isinstance(own, spaces.Box):
+            fits = np.allclose(own.low, theirs.low, rtol=1e-5) and np.allclose(own.high, theirs.high, rtol=1e-5)
+        if not fits:
+            raise ConfigError(f"the {what} of the environment are {theirs}, those of the model {own}", key="env", hint=hint)
+
+
 def callback_frequencies(callback: BaseCallback) -> list[tuple[str, int]]:
     """
     :param callback: callback, or a list or chain of them

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from sb3_dce.data.locate import catalogue_id, short_name
 from sb3_dce.envs import make_env, missing_simulator
 from sb3_dce.errors import CheckpointError, ConfigError
 from sb3_dce.evaluation import Evaluation, evaluate, read_evaluations
+from sb3_dce.files import quoted
 from sb3_dce.launch import launch
 from sb3_dce.plots import plot_learning_curves
 from sb3_dce.rollouts import Rollouts, rollouts_of
@@ -81,7 +81,7 @@ def train_seeds(
     files = "model.zip, config.yml" + (", evaluations.csv" if evaluated else "")
     console.print(f"saved  {folder}/seed_*/{files}{drawn}", markup=False, soft_wrap=True)
     needs = "" if evaluated else " --env <id of its environment>"
-    model = shlex.quote(f"{specs[0].folder}/model.zip")
+    model = quoted(f"{specs[0].folder}/model.zip")
     console.print(f"next   sb3-dce evaluate {model}{needs}", markup=False, soft_wrap=True)
     return results
 

@@ -91,6 +91,15 @@ def test_the_open_last_episode_does_not_count() -> None:
     assert longer.means == card.means
 
 
+def test_episodes_without_a_usable_row_do_not_count() -> None:
+    """Of one row, and without a next observation."""
+    rng = np.random.default_rng(0)
+    ends = np.isin(np.arange(400) % 20, (0, 19))
+    arrays = rng.standard_normal((400, 2)), rng.uniform(-1, 1, (400, 1)), rng.standard_normal(400), np.zeros(400), ends
+    card = DatasetCard.of(Transitions.from_arrays(*arrays))
+    assert card.episodes == 20 and card.means["length"] == 19.0
+
+
 def test_too_few_episodes_are_said_to_be_too_few() -> None:
     with pytest.raises(DatasetSemanticsError, match=r"9 whole episodes are too few.* 10 episodes"):
         verdict(made(0, episodes=9), made(1))

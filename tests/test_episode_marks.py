@@ -20,6 +20,7 @@ from sb3_dce.data.advice import examine
 from sb3_dce.data.selection import rows_of_best_episodes
 from sb3_dce.envs import SpacesEnv
 from sb3_dce.errors import DatasetError, DatasetFormatError, DatasetSemanticsError, DatasetWarning, SB3DCEError
+from tests.dataset_files import write_plain
 
 IDS = np.repeat(["B-12", "A-3", "B-1"], [5, 4, 6])
 
@@ -78,7 +79,8 @@ def test_true_ends_and_ids_go_together() -> None:
 @pytest.mark.parametrize(
     ("ids", "message"),
     [
-        (np.repeat([1, 2, 1], 5), "episode id 1 begins again in row 10.*Sort the rows"),
+        (np.repeat([1, 2, 1], 5), "row 10 has the episode id of earlier rows again.*Make the ids unique"),
+        (np.array([None, *["a"] * 14], dtype=object), "row 0 has no episode id"),
         (np.r_[np.nan, np.ones(14)], "row 0 has no episode id"),
     ],
 )
@@ -95,6 +97,47 @@ def test_an_empty_id_in_a_file_is_named_with_its_line(tmp_path: Path) -> None:
         load_dataset(tmp_path / "log.csv")
     with pytest.raises(DatasetSemanticsError, match="no value"):
         load_dataset(table)
+
+
+def test_a_number_of_episodes_beside_flags_is_no_id(tmp_path: Path) -> None:
+    """Runs that were put one after the other, each of which counts its episodes from 0 on."""
+    ends = np.isin(np.arange(15), [4, 9, 14]).astype(int)
+    table = frame(terminal=0, timeout=ends, episode=np.repeat([0, 1, 0], 5), episodes=1)
+    table.to_csv(tmp_path / "log.csv", index=False)
+    for source in (table, tmp_path / "log.csv"):
+        assert load_dataset(source).info.episode_lengths.tolist() == [5, 5, 5]
+    with pytest.raises(DatasetSemanticsError, match="row 10 has the episode id of earlier rows again"):
+        load_dataset(table, columns={"episodes": "episode"})
+
+
+@pytest.mark.parametrize("suffix", ["npz", "hdf5"])
+def test_files_of_arrays_may_hold_ids(suffix: str, tmp_path: Path) -> None:
+    path, arrays = tmp_path / f"data.{suffix}", {**steps(), "episodes": np.repeat([7, 3, 9], [5, 4, 6])}
+    for given in (arrays, {**arrays, "terminals": np.zeros(15)}):
+        write_plain(path, given) if suffix == "hdf5" else np.savez(path, **given)
+        data = load_dataset(path)
+        assert data.info.episode_lengths.tolist() == [5, 4, 6] and data.info.episode_rule.startswith(
+            "changes of the episode id"
+        )
+    flagged = {**arrays, "terminals": np.zeros(15), "timeouts": np.arange(15) == 14, "episodes": np.zeros(3)}
+    write_plain(path, flagged) if suffix == "hdf5" else np.savez(path, **flagged)
+    assert load_dataset(path).info.episode_lengths.tolist() == [15]  # whatever it is, it is not needed
+
+
+def test_ids_of_a_file_are_texts(tmp_path: Path) -> None:
+    """Numbers beyond 2**53 would become one."""
+    ids = np.repeat([2**60, 2**60 + 1, 2**60 + 2], 5)
+    frame(episode=ids).to_csv(tmp_path / "log.csv", index=False)
+    assert load_dataset(tmp_path / "log.csv").info.episode_lengths.tolist() == [5, 5, 5]
+    assert load_dataset({**steps(), "episodes": ids}).info.episode_lengths.tolist() == [5, 5, 5]
+
+
+def test_a_missing_id_is_no_missing_number(tmp_path: Path) -> None:
+    table = frame(episode=IDS.astype(object))
+    table.loc[14, "episode"] = None
+    table.to_csv(tmp_path / "log.csv", index=False)
+    with pytest.raises(DatasetFormatError, match=r"line 16, column 'episode': empty cell\. Fill it in$"):
+        load_dataset(tmp_path / "log.csv", drop_nonfinite=True)
 
 
 def test_rows_without_any_mark_are_said_to_be_one_episode(tmp_path: Path) -> None:
@@ -124,9 +167,10 @@ def test_a_list_of_episodes_is_a_dataset(kind: str) -> None:
     episodes: list[Any] = [episode(5), episode(3, terminated=True), episode(4)]
     source: Any = episodes if kind == "dictionaries" else [SimpleNamespace(**e) for e in episodes]
     if kind == "dataset":
-        source = SimpleNamespace(iterate_episodes=lambda: iter(source_episodes))
+        source = SimpleNamespace(iterate_episodes=lambda: iter(source_episodes), action_space=spaces.Box(-1.5, 1.5, (1,)))
         source_episodes = [SimpleNamespace(**e) for e in episodes]
     data = load_dataset(source)
+    assert data.info.action_space_high == (1.5 if kind == "dataset" else 1.0)
     assert len(data) == 12 and data.info.episode_lengths.tolist() == [5, 3, 4]
     assert (data.info.n_terminals, data.info.n_timeouts) == (1, 2)
     assert np.array_equal(data.next_observations[4], np.float32(episodes[0]["observations"][5]))
@@ -147,6 +191,9 @@ def test_episodes_without_the_last_observation_lose_their_last_step() -> None:
         ([episode(3), {**episode(3), "rewards": np.ones(2)}], "episode 1 has different numbers of rows"),
         ([episode(3), {**episode(3), "observations": np.ones((3, 2))}], "only some of the episodes"),
         ([{**episode(3), "observations": {"a": np.ones(4)}}], "episode 0 are in parts"),
+        ([episode(3), {**episode(3), "observations": np.ones((4, 3))}], "observations of episode 1 have width 3, those of"),
+        ([{**episode(3), "actions": 1.0}], r"actions of episode 0 have shape \(\)"),
+        ([{**episode(3), "terminations": np.full(3, np.nan)}], "episode 0, key terminals: flags must be 0/1"),
     ],
 )
 def test_lists_that_are_none_of_episodes_are_refused(episodes: list[Any], message: str) -> None:
@@ -194,6 +241,8 @@ def test_cut_episodes_of_a_buffer_have_no_return(ten_steps: Callable[[], gym.Env
 def test_what_a_full_buffer_has_overwritten_makes_an_episode_incomplete(ten_steps: Callable[[], gym.Env]) -> None:
     data = load_dataset(collected(ten_steps, 36, n_envs=2, size=2 * 24))
     assert len(data) == 48 and data.info.episode_lengths.tolist() == [10] * 2  # of 8 + 10 + 6 rows each
+    again = load_dataset(collected(ten_steps, 50, n_envs=1, size=25))  # overwritten for the second time, and at row 0 again
+    assert again.info.episode_lengths.tolist() == [10, 10]  # after a rest of 5 rows
 
 
 def test_episodes_that_ended_are_whole_up_to_the_last(ten_steps: Callable[[], gym.Env], tmp_path: Path) -> None:

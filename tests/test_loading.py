@@ -29,7 +29,9 @@ def as_frame(arrays: dict[str, np.ndarray]) -> pd.DataFrame:
 def as_buffer(arrays: dict[str, np.ndarray]) -> ReplayBuffer:
     obs, actions = arrays["observations"], arrays["actions"]
     observation_space = spaces.Box(-np.inf, np.inf, obs.shape[1:])
-    buffer = ReplayBuffer(len(obs), observation_space, spaces.Box(-1, 1, actions.shape[1:]), handle_timeout_termination=True)
+    buffer = ReplayBuffer(
+        len(obs) + 1, observation_space, spaces.Box(-1, 1, actions.shape[1:]), handle_timeout_termination=True
+    )
     for i in range(len(obs)):
         info = {"TimeLimit.truncated": bool(arrays["timeouts"][i])}
         done = np.array([arrays["terminals"][i] or arrays["timeouts"][i]])

@@ -48,11 +48,11 @@ def agent(request: pytest.FixtureRequest) -> Agent:
 class Bounded(gym.Wrapper[Any, Any, Any, Any]):
     """An environment that announces bounds of its observations, in single precision, as Pendulum does."""
 
-    def __init__(self, env: gym.Env[Any, Any], bound: float = 8.0, actions: float = 1.0) -> None:
+    def __init__(self, env: gym.Env[Any, Any], bound: float = 8.0, actions: float = 1.0, dtype: Any = np.float32) -> None:
         super().__init__(env)
         assert env.observation_space.shape is not None and env.action_space.shape is not None
         self.observation_space = spaces.Box(-bound, bound, env.observation_space.shape, np.float32)
-        self.action_space = spaces.Box(-actions, actions, env.action_space.shape, np.float32)
+        self.action_space = spaces.Box(-actions, actions, env.action_space.shape, dtype)
 
 
 # -- environments ------------------------------------------------------------------------------------------------------
@@ -85,28 +85,30 @@ def test_an_environment_with_other_actions_is_refused(
     env = Bounded(make_point_mass(), actions=2.0)
     with pytest.raises(ConfigError, match=r"actions of the environment are Box\(-2.*those of the model Box\(-1.*action_scale"):
         model.set_env(env) if given_at == "set_env" else OfflineBC.load(tmp_path / "model.zip", env=env)
-
-
-def test_known_bounds_of_observations_are_not_given_up(
-    transitions: Transitions, make_point_mass: Callable[[], gym.Env]
-) -> None:
-    model = OfflineBC("MlpPolicy", Bounded(make_point_mass()), transitions, policy_kwargs={"net_arch": [8]})
-    with pytest.raises(ConfigError, match="observations of the environment"):
-        model.set_env(Bounded(make_point_mass(), bound=9.0))
+    before = model.observation_space
+    several = DummyVecEnv([make_point_mass] * 2)
+    with pytest.raises(ConfigError, match="wants one environment, got 2 in one"):
+        model.set_env(several) if given_at == "set_env" else OfflineBC.load(tmp_path / "model.zip", env=several)
+    assert model.observation_space == before
+    model.set_env(Bounded(make_point_mass(), dtype=np.float64))  # the same bounds in another precision
 
 
 def test_a_model_is_not_evaluated_where_it_does_not_belong(transitions: Transitions, tmp_path: Path) -> None:
     model = OfflineBC("MlpPolicy", dataset=transitions, policy_kwargs={"net_arch": [8]})
     rollouts = make_rollouts(TINY, 1)
     assert rollouts is not None
-    message = r"model has observations of shape \(5,\), the environment to evaluate in of \(17,\)"
+    message = (
+        r"observations of the environment are Box\(-inf, inf, \(17,\), float64\), those of the model Box\(-inf, inf, \(5,\)"
+    )
     with pytest.raises(ConfigError, match=message):
         evaluate(model, rollouts, seed=0)
     with pytest.raises(ConfigError, match=message):
         model.learn(1, callback=EvaluationCallback(rollouts, TINY, eval_freq=1))
     model.save(tmp_path / "model.zip")
     outcome = sb3_dce("evaluate", str(tmp_path / "model.zip"), "--dataset", TINY)
-    assert outcome.code == 2 and "observations of shape (5,)" in outcome.stderr and "Traceback" not in outcome.stderr
+    assert (
+        outcome.code == 2 and "those of the model Box(-inf, inf, (5,)" in outcome.stderr and "Traceback" not in outcome.stderr
+    )
 
 
 def test_a_mistyped_dataset_is_no_reason_to_evaluate_nothing() -> None:
@@ -306,6 +308,17 @@ def test_a_name_in_a_file_imports_nothing(tmp_path: Path, transitions: Transitio
     assert rollouts_of(str(tmp_path / "mine.hdf5"), 1) is None and "antigravity" not in sys.modules
 
 
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", "CartPole-v1", "FrozenLake-v1", "Nowhere-v0"])
+def test_an_environment_that_does_not_fit_the_rows_is_left_alone(
+    env_id: str, tmp_path: Path, transitions: Transitions
+) -> None:
+    transitions.to_hdf5(tmp_path / "mine.hdf5")
+    with h5py.File(tmp_path / "mine.hdf5", "a") as file:
+        file.attrs["env_id"] = env_id
+    model = OfflineBC.load_dataset(tmp_path / "mine.hdf5", batch_size=8, policy_kwargs={"net_arch": [8]}).learn(1)
+    assert model.observation_space.shape == (5,) and rollouts_of(str(tmp_path / "mine.hdf5"), 1) is None
+
+
 # -- command line ------------------------------------------------------------------------------------------------------
 
 
@@ -325,7 +338,7 @@ def test_tensorboard_is_written_by_runs_that_ask_for_it(tmp_path: Path) -> None:
     small = ("--updates", "10", "--eval-freq", "10", "--eval-episodes", "1", "--set", "policy_kwargs={net_arch: [8]}")
     options = (*small, "--set", f"tensorboard_log={tmp_path / 'tb'}", "--out", str(tmp_path / "run"), "--workers", "1")
     assert sb3_dce("train", TINY, "--algo", "bc", *options).code == 0
-    assert list((tmp_path / "tb" / "offline_bc_0").glob("events.*"))
+    assert list((tmp_path / "tb" / f"offline_bc_{TINY}_0").glob("events.*"))
 
 
 # -- what users of Stable-Baselines3 share -----------------------------------------------------------------------------
@@ -337,19 +350,22 @@ def test_a_dictionary_shared_with_sac_is_taken(transitions: Transitions, make_po
     OfflineDCE("MlpPolicy", dataset=transitions, policy_kwargs={**shared, "use_sde": False})
 
 
-def test_a_model_without_its_normalisation_is_loaded_with_a_warning(
+def test_an_environment_without_the_normalisation_of_a_model_is_warned_of(
     transitions: Transitions, make_point_mass: Callable[[], gym.Env], tmp_path: Path
 ) -> None:
     env = VecNormalize(DummyVecEnv([make_point_mass]), norm_reward=False)
     model = OfflineBC("MlpPolicy", env, transitions, batch_size=8, policy_kwargs={"net_arch": [8]}).learn(1)
     model.save(tmp_path / "model.zip")
     with pytest.warns(SB3DCEWarning, match="trained behind a VecNormalize"):
-        OfflineBC.load(tmp_path / "model.zip")
-    with pytest.warns(SB3DCEWarning, match="trained behind a VecNormalize"):
         OfflineBC.load(tmp_path / "model.zip", env=DummyVecEnv([make_point_mass]))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         OfflineBC.load(tmp_path / "model.zip", env=env)
+        # its caller may normalise by itself, as the zoo's enjoy script does
+        loaded = OfflineBC.load(tmp_path / "model.zip")
+        loaded.set_dataset(transitions)
+        with pytest.raises(ConfigError, match="trained behind a VecNormalize"):
+            loaded.learn(1)
 
 
 def test_members_of_a_population_are_trained_models_at_once(transitions: Transitions, tmp_path: Path) -> None:
@@ -366,6 +382,16 @@ def test_members_of_a_population_are_trained_models_at_once(transitions: Transit
     for wrong in (-1, 1.5, "3"):
         with pytest.raises(ConfigError, match="n_updates must be a whole number"):
             population.train(wrong)  # type: ignore[arg-type]
+
+
+def test_a_member_that_was_trained_by_itself_is_no_member_any_more(transitions: Transitions) -> None:
+    for change in (lambda m: m.learn(2), lambda m: m.set_parameters(m.get_parameters()), lambda m: m.policy.double()):
+        models = [make(AGENTS["BC"], dataset=transitions, seed=seed) for seed in (0, 1)]
+        population = Population(models)
+        population.train(1)
+        change(models[1])
+        with pytest.raises(ConfigError, match=r"member 1 was trained, loaded or moved by itself.*new Population"):
+            population.train(1)
 
 
 def test_an_interrupted_population_keeps_what_it_has(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ and rows that are not used are squeezed out in place.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -118,6 +119,8 @@ def build_rows(
     # Kitchen's terminals mark the end of every demonstration: its time limit is that of the evaluation.
     counts_steps = options.max_episode_steps is not None or spec is None or spec.family != "kitchen"
     episodes = find_episodes(terminals, timeouts, limit if counts_steps else None, jumps)
+    if EPISODES in sources:
+        episodes = replace(episodes, rule="changes of the episode id, and flags where there are some")
     if options.d4rl_compat:
         used = d4rl_rows(terminals, timeouts, limit)
     else:

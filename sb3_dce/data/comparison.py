@@ -61,10 +61,11 @@ class DatasetCard:
         """
         info = transitions.info
         values = dict(_per_episode(transitions)) if len(info.episode_numbers) else {}
+        n_episodes = len(values["return"]) if values else 0
         return cls(
             id=info.id,
             rows=len(transitions),
-            episodes=len(info.episode_numbers),
+            episodes=n_episodes,
             content_hash=content_hash({key: getattr(transitions, key) for key in CORE_KEYS}),
             sha256=info.sha256,
             means={name: float(value.mean()) for name, value in values.items()},
@@ -172,8 +173,9 @@ def _distance(first: DatasetCard, second: DatasetCard, name: str) -> float:
 
 def _per_episode(transitions: Transitions) -> Iterator[tuple[str, np.ndarray]]:
     info, numbers = transitions.info, transitions.episodes
-    yield "return", info.episode_returns
-    yield "length", info.episode_lengths.astype(float)
+    has_rows = np.isin(info.episode_numbers, numbers)  # an episode of one row may have none whose next observation is known
+    yield "return", info.episode_returns[has_rows]
+    yield "length", info.episode_lengths[has_rows].astype(float)
     starts = np.flatnonzero(np.diff(numbers, prepend=-1))
     whole = np.isin(numbers[starts], info.episode_numbers)
     counts = np.diff(starts, append=len(numbers))

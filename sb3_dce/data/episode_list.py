@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_dce.data.layout import read_flags
 from sb3_dce.errors import ConfigError, DatasetFormatError
 
 _OTHER_NAMES = {"terminals": "terminations", "timeouts": "truncations"}
@@ -34,6 +35,12 @@ def arrays_from_episodes(episodes: Iterable[Any]) -> dict[str, np.ndarray]:
             hint="Give it for all, or leave it out for all",
             key="next_observations",
         )
+    for name in ("observations", "actions"):
+        widths = [part[name].shape[1] for part in parts]
+        if len(set(widths)) > 1:
+            other = next(i for i, width in enumerate(widths) if width != widths[0])
+            what = f"the {name} of episode {other} have width {widths[other]}, those of episode 0 {widths[0]}"
+            raise DatasetFormatError(what, hint="All episodes need the same entries", key=name)
     return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 
 
@@ -54,12 +61,19 @@ def _arrays_of(episode: Any, number: int) -> dict[str, np.ndarray]:
         hint = "Flatten them into vectors; a dataset of Minari is given by its id, with flatten=True"
         raise DatasetFormatError(f"the observations of episode {number} are in parts", hint=hint, key="observations")
     arrays = {name: np.asarray(value) for name, value in given.items() if value is not None}
+    for name in ("observations", "actions"):
+        if arrays[name].ndim == 1:
+            arrays[name] = arrays[name][:, None]
+        if arrays[name].ndim != 2:
+            what = f"the {name} of episode {number} have shape {arrays[name].shape}, wanted is (rows, width)"
+            raise DatasetFormatError(what, hint="Flatten them into vectors", key=name)
     n = len(arrays["actions"])
     if len(arrays["observations"]) == n + 1:
         arrays["next_observations"] = arrays["observations"][1:]
         arrays["observations"] = arrays["observations"][:-1]
     for name in _OTHER_NAMES:
-        arrays[name] = arrays.get(name, np.zeros(n)).astype(bool)
+        flags = arrays.get(name, np.zeros(n))
+        arrays[name] = read_flags(flags, name, f"episode {number}") if flags.ndim else flags[None]
     lengths = {name: len(array) for name, array in arrays.items()}
     if n == 0 or len(set(lengths.values())) > 1:
         shown = ", ".join(f"{name} {length}" for name, length in lengths.items())

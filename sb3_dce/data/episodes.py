@@ -115,9 +115,9 @@ def ends_of_ids(ids: np.ndarray, where: str) -> np.ndarray:
     if len(once) < len(firsts):
         row = int(np.setdiff1d(firsts, firsts[once])[0])
         raise DatasetSemanticsError(
-            f"the episode id {ids[row]:g} begins again in row {row}, after rows of other episodes",
+            f"row {row} has the episode id of earlier rows again, after rows of other episodes",
             where=where,
-            hint="Sort the rows by episode and time",
+            hint="Make the ids unique, for example run and episode; or sort the rows by episode and time, if they got mixed",
             key=EPISODES,
             index=row,
         )

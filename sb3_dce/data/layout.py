@@ -111,6 +111,15 @@ class RowLayout:
         return 2 * self.obs_dim + self.act_dim + 2
 
 
+def wanted_keys(keys: Iterable[str]) -> tuple[str, ...]:
+    """
+    :param keys: of a file
+    :return: those that are read if they are there; ids of episodes only where flags are missing that would say the same
+    """
+    has_flags = {"terminals", "timeouts"} <= set(keys)
+    return (*CORE_KEYS, INCOMPLETE) if has_flags else (*CORE_KEYS, INCOMPLETE, EPISODES)
+
+
 def row_blocks(n_rows: int, block_rows: int = BLOCK_ROWS) -> Iterator[slice]:
     """
     Cut rows into blocks.

@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping
 from os import PathLike
 from typing import Any
 
+import numpy as np
+
 from sb3_dce.data.episode_list import arrays_from_episodes
 from sb3_dce.data.hash_record import as_sha256, verify_hash, verify_record
 from sb3_dce.data.layout import CORE_KEYS, EPISODES, REQUIRED_KEYS
@@ -90,6 +92,10 @@ def load_dataset(source: Any, **options: Any) -> Transitions:
     if isinstance(source, list | tuple) or hasattr(source, "iterate_episodes"):
         episodes = source if isinstance(source, list | tuple) else source.iterate_episodes()
         arrays: dict[str, Any] = arrays_from_episodes(episodes)
+        space: Any = getattr(source, "action_space", None)  # of a dataset of Minari
+        given = options.keys() & {"action_low", "action_high", "action_scale"}
+        if not given and hasattr(space, "low") and np.isfinite((space.low, space.high)).all():
+            options |= {"action_low": np.ravel(space.low), "action_high": np.ravel(space.high)}
         return Transitions.from_arrays(**arrays, **options)
     if type(source).__module__.partition(".")[0] == "pandas":
         return Transitions.from_dataframe(source, **options)

@@ -7,12 +7,13 @@ import os
 import socket
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TextIO
 
-from sb3_dce.errors import LockedError
+from sb3_dce.errors import LockedError, SB3DCEWarning
 
 POLL_SECONDS = 0.1
 
@@ -55,7 +56,7 @@ def held(path: Path) -> Iterator[None]:
     :raises OSError: if the folder cannot be written
     """
     while True:
-        file = open(path, "a+", encoding="utf-8")
+        file = _opened(path)
         try:
             if not _lock(file):
                 raise BlockingIOError(_owner(path))
@@ -66,9 +67,10 @@ def held(path: Path) -> Iterator[None]:
             raise
         file.close()  # its owner has just removed it
     with file:
-        file.truncate(0)
-        json.dump({"pid": os.getpid(), "host": socket.gethostname()}, file)
-        file.flush()
+        if file.writable():
+            file.truncate(0)
+            json.dump({"pid": os.getpid(), "host": socket.gethostname()}, file)
+            file.flush()
         try:
             yield
         finally:
@@ -76,8 +78,18 @@ def held(path: Path) -> Iterator[None]:
                 path.unlink(missing_ok=True)
 
 
+def _opened(path: Path) -> TextIO:
+    """The file of another user, left by a process that was killed, can still be locked."""
+    try:
+        return open(path, "a+", encoding="utf-8")
+    except PermissionError:
+        if not os.path.isfile(path):
+            raise
+        return open(path, encoding="utf-8")
+
+
 def _lock(file: TextIO) -> bool:
-    """Whether the lock is ours now; also where the file system has none, as some network disks."""
+    """Whether the lock is ours now; also, with a warning, where the file system has none, as some network disks."""
     if sys.platform == "win32":
         import msvcrt
 
@@ -93,8 +105,9 @@ def _lock(file: TextIO) -> bool:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
-    except OSError:
-        pass
+    except OSError as error:
+        text = f"{file.name}: this file system has no locks ({error.strerror}); let one process at a time work there"
+        warnings.warn(text, SB3DCEWarning)
     return True
 
 

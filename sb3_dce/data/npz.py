@@ -24,7 +24,7 @@ from numpy.lib import format as npy
 
 from sb3_dce.data.file_checks import translated_errors
 from sb3_dce.data.hdf5 import DEFAULT_MAX_BYTES, MAX_OBJECTS, MAX_RATIO, RATIO_APPLIES_ABOVE
-from sb3_dce.data.layout import CORE_KEYS, INCOMPLETE
+from sb3_dce.data.layout import wanted_keys
 from sb3_dce.data.locate import require_file
 from sb3_dce.data.memory import require_memory
 from sb3_dce.errors import DatasetError, DatasetFormatError, DatasetIntegrityError, DatasetSecurityError
@@ -43,7 +43,7 @@ def arrays_from_npz(path: str | PathLike[str], *, max_bytes: int = DEFAULT_MAX_B
 
     :param path: file written with ``numpy.savez`` or ``numpy.savez_compressed``
     :param max_bytes: largest total size of these arrays, uncompressed
-    :return: those of ``observations, actions, rewards, terminals, timeouts, next_observations`` that are there
+    :return: those of :func:`~sb3_dce.data.layout.wanted_keys` that are there
     :raises DatasetSecurityError: for pickled objects, odd or repeated member names, and sizes that are too large or contradict
         each other
     :raises DatasetFormatError: if it is no NPZ file, or a member is no array of numbers
@@ -162,7 +162,8 @@ def _select(infos: Iterable[zipfile.ZipInfo], path: Path, max_bytes: int) -> dic
         elif twice:
             what = f"member {twice[0][:60]!r} is there more than once"
         raise DatasetSecurityError(what, where=str(path), hint="Write the arrays again with numpy.savez", path=path)
-    members = {name: info for name, info in zip(names, infos, strict=True) if name in (*CORE_KEYS, INCOMPLETE)}
+    wanted = wanted_keys(names)
+    members = {name: info for name, info in zip(names, infos, strict=True) if name in wanted}
     total = sum(info.file_size for info in members.values())
     if total > max_bytes:
         raise DatasetSecurityError(

@@ -44,7 +44,13 @@ def without_word(flag: str) -> str:
 
 
 def read_plain(
-    path: Path, sep: str, skip_lines: int, n_columns: int, cells: Sequence[int], flags: Sequence[int]
+    path: Path,
+    sep: str,
+    skip_lines: int,
+    n_columns: int,
+    cells: Sequence[int],
+    flags: Sequence[int],
+    ids: Sequence[int] = (),
 ) -> np.ndarray | None:
     """
     Numbers of a table without quotes in which each line has the same number of cells.
@@ -55,11 +61,13 @@ def read_plain(
     :param n_columns: cells of each line
     :param cells: positions of the wanted columns, in the order of the result
     :param flags: which of these are flags, as indices of ``cells``
+    :param ids: which of these are ids, texts that are given numbers
     :return: shape (rows, len(cells)), float64; None if the file is not plain, or a cell is no number or no flag
     """
-    flag_cells = {cells[n] for n in flags}
-    if len(flag_cells) + len({cell for n, cell in enumerate(cells) if n not in flags}) != len(set(cells)):
-        return None  # one column is both, so it has two ways of reading
+    flag_cells, id_cells = {cells[n] for n in flags}, {cells[n] for n in ids}
+    others = {cell for n, cell in enumerate(cells) if n not in (*flags, *ids)}
+    if len(flag_cells) + len(id_cells) + len(others) != len(set(cells)):
+        return None  # one column is two of these, so it has two ways of reading
     if sep not in _SEPARATORS or n_columns < 2:
         return None
     with open(path, "rb") as file:
@@ -70,7 +78,7 @@ def read_plain(
         if not n_rows:
             return None
         file.seek(len(head))
-        return _parse(file, sep, n_rows, cells, flag_cells)
+        return _parse(file, sep, n_rows, cells, flag_cells, id_cells)
 
 
 def _count_rows(file: BinaryIO, sep: str, n_columns: int) -> int | None:
@@ -119,11 +127,15 @@ def _has_line_longer_than(limit: int, block: bytes) -> bool:
     return False
 
 
-def _parse(file: BinaryIO, sep: str, n_rows: int, cells: Sequence[int], flag_cells: Collection[int]) -> np.ndarray | None:
+def _parse(
+    file: BinaryIO, sep: str, n_rows: int, cells: Sequence[int], flag_cells: Collection[int], id_cells: Collection[int]
+) -> np.ndarray | None:
     import pandas as pd
 
+    texts = {*flag_cells, *id_cells}
+    known: dict[int, dict[str, int]] = {cell: {} for cell in id_cells}
     options: dict[str, Any] = {
-        "dtype": {cell: str if cell in flag_cells else np.float64 for cell in cells},
+        "dtype": {cell: str if cell in texts else np.float64 for cell in cells},
         "keep_default_na": False,
         "na_values": ["nan", "NaN", "NAN"],
     }
@@ -147,11 +159,15 @@ def _parse(file: BinaryIO, sep: str, n_rows: int, cells: Sequence[int], flag_cel
             )
             # pandas makes 1.0 of True if a whole column consists of such words; then the first line has one, too.
             first = block[: block.index(b"\n")].decode().split(sep)
-            if numbers_of([first[cell] for cell in cells if cell not in flag_cells]) is None:
+            if numbers_of([first[cell] for cell in cells if cell not in texts]) is None:
                 return None
             start, end = end, end + len(frame)
             for n, cell in enumerate(cells):
-                matrix[start:end, n] = _flags(*pd.factorize(frame[cell])) if cell in flag_cells else frame[cell]
+                if cell in texts:
+                    codes, found = pd.factorize(frame[cell])
+                    matrix[start:end, n] = _flags(codes, found) if cell in flag_cells else _ids(codes, found, known[cell])
+                else:
+                    matrix[start:end, n] = frame[cell]
     except ValueError:  # a cell that is not a number, or not a flag; pandas' ParserError is one, too
         return None
     return matrix if end == n_rows else None
@@ -167,3 +183,15 @@ def _flags(codes: np.ndarray, texts: Iterable[str]) -> np.ndarray:
     if numbers is None or not set(numbers) <= {0.0, 1.0} or (codes < 0).any():
         raise ValueError("not a flag")
     return np.array(numbers)[codes]
+
+
+def _ids(codes: np.ndarray, texts: Iterable[str], known: dict[str, int]) -> np.ndarray:
+    """
+    Numbers of the ids of a column, the same for the same text in all blocks.
+
+    :raises ValueError: if one is missing
+    """
+    names = [text.strip() for text in texts]
+    if "" in names or (codes < 0).any():
+        raise ValueError("no id")
+    return np.array([known.setdefault(name, len(known)) for name in names])[codes]

@@ -53,7 +53,7 @@ def arrays_from_replay_buffer(buffer: Any) -> dict[str, np.ndarray]:
     if len(order):
         incomplete[last] = ~dones[last]
         timeouts[last] |= ~terminals[last]
-        if buffer.full and buffer.pos:  # at position 0 it has just become full
+        if buffer.full:  # whether anything was overwritten cannot be seen
             incomplete[len(order) * np.arange(n_envs)] = True
     arrays = {
         "observations": per_env(buffer.observations),

@@ -47,7 +47,7 @@ NAMES = {
     "terminals": ("terminal", "terminals", "terminated"),
     "timeouts": ("timeout", "timeouts", "truncated"),
     "next_observations": ("next_obs", "next_observation", "next_observations"),
-    EPISODES: ("episode", "episodes", "episode_id"),
+    EPISODES: ("episode_id", "episode", "episodes"),
 }
 KEYS = tuple(NAMES)
 AMBIGUOUS_NAMES = ("done", "dones")
@@ -149,7 +149,10 @@ def _find_columns(names: Sequence[Any], columns: Columns | None, where: str) -> 
         raise DatasetFormatError(
             f"column {twice[0]!r} is there {names.count(twice[0])} times", where=where, hint="Rename one", key=str(twice[0])
         )
-    found = _by_name(names, where) | _by_mapping(names, columns or {}, where)
+    named = _by_mapping(names, columns or {}, where)
+    found = _by_name(names, where) | named
+    if {"terminals", "timeouts"} <= found.keys() and EPISODES not in named:
+        found.pop(EPISODES, None)  # the flags say it; such a number may begin again in each of several runs
     missing = [key for key in REQUIRED_KEYS if key not in found and not (key == "terminals" and EPISODES in found)]
     if not missing:
         return {key: found[key] for key in KEYS if key in found}
@@ -174,6 +177,8 @@ def _by_name(names: Sequence[Any], where: str) -> dict[str, list[int]]:
         if key is None or (number is not None and key not in MATRIX_KEYS):
             continue
         others = numbered.setdefault(key, {})
+        if key == EPISODES and others:  # one of these names is enough
+            continue
         number = number or 0  # one column without a number is a matrix of width 1, or the lists that _numbers() refuses
         if number in others:
             both = f"{names[others[number]]!r} and {name!r}"
@@ -270,10 +275,17 @@ def _numbers(column: pd.Series[Any], key: str, where: str) -> np.ndarray:
 
 def numbered(ids: np.ndarray) -> np.ndarray:
     """
-    :param ids: of episodes, numbers or anything that can be compared, shape (n,)
+    :param ids: of episodes, numbers or texts, shape (n,)
     :return: a number for each, shape (n,)
+    :raises DatasetSemanticsError: if one is missing
     """
-    return ids if ids.dtype.kind in "fiub" else np.unique(ids.astype(str), return_inverse=True)[1]
+    if ids.dtype.kind in "fiub":
+        return ids
+    missing = [row for row, value in enumerate(ids.tolist()) if value is None or value != value]
+    if missing:
+        hint = "Give every row the id of its episode"
+        raise DatasetSemanticsError(f"row {missing[0]} has no episode id", hint=hint, key=EPISODES, index=missing[0])
+    return np.unique(ids.astype(str), return_inverse=True)[1]
 
 
 # -- CSV -----------------------------------------------------------------------------------------------------------
@@ -345,7 +357,8 @@ def _split(records: _Records, columns: Columns | None, path: Path, sep: str, bla
     cells_of_keys = [(key, i) for key, positions in found.items() for i in positions]
     cells = [i for _, i in cells_of_keys]
     flags = [n for n, (key, _) in enumerate(cells_of_keys) if key in FLAG_KEYS]
-    matrix = read_plain(path, sep, records.lines_read, len(names), cells, flags)
+    ids = [n for n, (key, _) in enumerate(cells_of_keys) if key == EPISODES]
+    matrix = read_plain(path, sep, records.lines_read, len(names), cells, flags, ids)
     if matrix is None:
         matrix = _by_record(rows, records, names, cells_of_keys, path, blank_is_nan)
     edges = np.cumsum([len(chosen) for chosen in found.values()])[:-1]
@@ -374,7 +387,7 @@ def _by_record(
             )
         cells = list(pick(record))
         if blank_is_nan:
-            cells = [cell if cell.strip() or n in flags else "nan" for n, cell in enumerate(cells)]
+            cells = [cell if cell.strip() or n in flags or n in ids else "nan" for n, cell in enumerate(cells)]
         for n in flags:
             cells[n] = without_word(cells[n])
         for n in ids:
@@ -399,7 +412,9 @@ def _bad_cell(
     if not cell.strip():
         what = "empty cell"
         # without the line its neighbours would pass for one step after the other
-        hint = "Fill it in" if key in FLAG_KEYS else "Fill it in, or pass drop_nonfinite=True, which leaves this step out"
+        hint = "Fill it in, or pass drop_nonfinite=True, which leaves this step out"
+        if key in (*FLAG_KEYS, EPISODES):
+            hint = "Fill it in"
     elif cell.startswith("="):
         what, hint = f"a formula, {cell[:60]!r}; it was not computed", "Save the values instead of the formulas"
     elif "," in cell:

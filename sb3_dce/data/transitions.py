@@ -16,7 +16,7 @@ from sb3_dce.data.catalog import DatasetSpec, normalized_score
 from sb3_dce.data.hash_record import verify_hash
 from sb3_dce.data.hashes import content_hash, file_sha256
 from sb3_dce.data.hdf5 import D4RLFile, write_hdf5
-from sb3_dce.data.layout import CORE_KEYS, EPISODES, INCOMPLETE, ArraySource, RowLayout
+from sb3_dce.data.layout import CORE_KEYS, EPISODES, INCOMPLETE, ArraySource, RowLayout, wanted_keys
 from sb3_dce.data.minari import METADATA_FILE, Flatten, action_bounds, find_minari, reward_note
 from sb3_dce.data.minari_episodes import open_episodes
 from sb3_dce.data.npz import arrays_from_npz, npz_keys, text_from_npz, write_npz
@@ -168,7 +168,7 @@ class Transitions:
     ) -> Transitions:
         """
         Read a text file with the columns ``obs_0, ..., action_0, ..., reward, terminal`` and, where present, ``timeout`` and
-        ``next_obs_0, ...``.
+        ``next_obs_0, ...``. ``episode_id`` may stand for ``terminal`` and ``timeout``, see :meth:`from_arrays`.
 
         :param path: file with a line of column names
         :param columns: ``observations``, ``actions``, ... to column name or names; keys left out are found by name
@@ -452,7 +452,7 @@ def _rows_of_hdf5(path: Path, spec: DatasetSpec | None, options: ReadOptions) ->
                 hint="Give it its own name, such ids end in -sb3",
             )
         options = options.with_bounds_of(file.attributes().get(BOUNDS_ATTRIBUTE), str(path))
-        dataset_id, sources = spec.id if spec else path.stem, file.select((*CORE_KEYS, INCOMPLETE))
+        dataset_id, sources = spec.id if spec else path.stem, file.select(wanted_keys(file.keys))
         return build_rows(sources, dataset_id=dataset_id, path=path, found_keys=file.keys, spec=spec, options=options)
 
 
