@@ -258,6 +258,8 @@ def make_recorded_env(path: str | PathLike[str]) -> gym.Env | None:
     env_id = attributes.get("env_id") if attributes.get("generated") else None
     if not isinstance(env_id, str) or ":" in env_id:  # module:EnvId would import, and so run, what the file names
         return None
+    if any(spec.env_id == env_id and spec.family != "gym" for spec in catalog.all_specs()):
+        return None  # by its id it pays other rewards than those of the datasets, which are corrected
     try:
         env = make_env(env_id)
     except ConfigError:

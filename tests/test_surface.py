@@ -308,7 +308,7 @@ def test_a_name_in_a_file_imports_nothing(tmp_path: Path, transitions: Transitio
     assert rollouts_of(str(tmp_path / "mine.hdf5"), 1) is None and "antigravity" not in sys.modules
 
 
-@pytest.mark.parametrize("env_id", ["Pendulum-v1", "CartPole-v1", "FrozenLake-v1", "Nowhere-v0"])
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", "CartPole-v1", "FrozenLake-v1", "Nowhere-v0", "AdroitHandDoor-v1"])
 def test_an_environment_that_does_not_fit_the_rows_is_left_alone(
     env_id: str, tmp_path: Path, transitions: Transitions
 ) -> None:
