@@ -126,6 +126,17 @@ def test_totals_have_the_papers_sum_of_deviations_beside_the_honest_one() -> Non
     assert cell(table, "CQL", "paper: total of its rows, D4RL") == "131.0", "72.5 and 58.5"
 
 
+def test_an_agent_with_little_does_not_take_the_others_data_out_of_the_totals() -> None:
+    four = {"BC": [10.0], "IQL": [30.0], "DCE": [20.0]}
+    names = ("halfcheetah-medium-replay-sb3", "hopper-medium-sb3", "walker2d-medium-sb3")
+    rows = table_rows(TABLE, {CHEETAH: {**four, "CQL": [25.0]}, **{name: four for name in names}})
+    evidence = evidence_of(rows)
+    assert len(common_rows(evidence, "sb3")) == 4
+    assert [row[0] for row in aggregate_tables(evidence)["sb3"].rows] == ["BC", "IQL", "DCE"]
+    half = table_rows(TABLE, {CHEETAH: {**four, "CQL": [25.0]}, names[0]: {**four, "CQL": [5.0]}, names[1]: four})
+    assert len(common_rows(evidence_of(half), "sb3")) == 2
+
+
 def test_totals_are_over_all_data_of_the_papers_agents_and_show_no_run_twice() -> None:
     own = {"BC": [10.0], "IQL": [30.0], "DCE": [20.0]}
     rows = table_rows(TABLE, {CHEETAH: own, "hopper-medium-sb3": own})

@@ -180,13 +180,14 @@ def common_rows(evidence: Evidence, part: str) -> list[str]:
     """
     :param evidence: rows
     :param part: one of :func:`parts_of`
-    :return: data of this part on which every agent of the paper that has runs in it has a score
+    :return: data of this part on which every agent of the paper has a score, but for agents that have run on fewer than half
+        of the data of the one with the most: a total over the little they have would say nothing about the others
     """
     ids = _rows_of_part(evidence, part)
-    variants = [v for v in evidence.experiment.variants if v.paper is not None and _has_any(evidence, v, ids)]
-    if not variants:
-        return []
-    return [name for name in ids if all(len(evidence.last(v, name)) for v in variants)]
+    papers = [v for v in evidence.experiment.variants if v.paper is not None]
+    counts = [sum(len(evidence.last(v, name)) > 0 for name in ids) for v in papers]
+    variants = [v for v, count in zip(papers, counts, strict=True) if count and 2 * count >= max(counts)]
+    return [name for name in ids if variants and all(len(evidence.last(v, name)) for v in variants)]
 
 
 def compared(evidence: Evidence, ids: list[str]) -> list[Variant]:
@@ -213,10 +214,6 @@ def _rows_of_part(evidence: Evidence, part: str) -> list[str]:
 
 def _counted(n: int) -> str:
     return "the one data set" if n == 1 else f"the {n} data sets"
-
-
-def _has_any(evidence: Evidence, variant: Variant, ids: list[str]) -> bool:
-    return any(len(evidence.last(variant, name)) for name in ids)
 
 
 def aggregate_tables(evidence: Evidence) -> dict[str, TextTable]:
@@ -264,7 +261,8 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
             )
         )
     note = (
-        f"Over {_counted(len(ids))} on which all agents of the paper that were run have runs of one length. The interval is a "
+        f"Over {_counted(len(ids))} on which the paper's agents have runs of one length; those that were run on fewer than "
+        "half of the data are left out. The interval is a "
         f"stratified bootstrap over seeds within data sets ({N_RESAMPLES:,} resamples; none with one seed); the deviation of "
         f"the total takes the rows as independent. {MIXED_PROTOCOLS}"
     )
