@@ -172,7 +172,7 @@ def check_env_fits(model: Any, env: Any, hint: str) -> None:
     :param hint: what to do
     :raises ConfigError: if it sees observations of another shape, or does other actions
     """
-    for name, what in (("observation_space", "observations"), ("action_space", "actions")):
+    for name, what in (("observation_space", "Observation"), ("action_space", "Action")):
         own, theirs = getattr(model, name, None), getattr(env, name)
         if own is None:
             continue
@@ -180,7 +180,8 @@ def check_env_fits(model: Any, env: Any, hint: str) -> None:
         if fits and name == "action_space" and isinstance(own, spaces.Box):
             fits = np.allclose(own.low, theirs.low, rtol=1e-5) and np.allclose(own.high, theirs.high, rtol=1e-5)
         if not fits:
-            raise ConfigError(f"the {what} of the environment are {theirs}, those of the model {own}", key="env", hint=hint)
+            text = f"{what} spaces do not match: {theirs} of the environment, {own} of the model"  # the words of SB3
+            raise ConfigError(text, key="env", hint=hint)
 
 
 def callback_frequencies(callback: BaseCallback) -> list[tuple[str, int]]:

@@ -1124,7 +1124,7 @@ def test_wrong_argument_is_refused_by_the_constructor(key: str, name: str, value
         ({"nonsense": 1}, "no parameter 'nonsense'. It has net_arch"),
         ({"net_arch": 8}, "net_arch must be a list"),
         ({"net_arch": [-3]}, "net_arch must be a list"),
-        ({"net_arch": {"pi": [8.0]}}, "net_arch must be a list"),
+        ({"net_arch": {"pi": [8.0], "qf": [8]}}, r"net_arch\['pi'\] must be a list"),
         ({"activation_fn": "tanh"}, "activation_fn must be a class"),
         ({"n_critics": 0}, "n_critics must be an integer"),
     ],

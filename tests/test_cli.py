@@ -172,7 +172,7 @@ def test_an_interrupted_run_goes_on_and_ends_like_an_uninterrupted_one(tmp_path:
         (("train", TINY, "--set", "expectile=1.7"), ("expectile must be", "1.7", "0.7")),
         (("train", TINY, "--set", "n_timesteps=5"), ("no parameter 'n_timesteps'",)),
         (("train", TINY, "--updates", "inf"), ("whole number", "inf")),
-        (("train", TINY, "--updates", "0.5"), ("whole number", "0.5")),
+        (("train", TINY, "--updates", "1.5"), ("whole number", "1.5")),
         (("train", TINY, "--algo", "dse"), ("unknown algorithm 'dse'", "dce")),
         (("compare", "--dataset", TINY, "--updates", "inf"), ("whole number", "inf")),
         (("compare", "--dataset", TINY, "--updates-of", "pbrl"), ("AGENT=UPDATES", "pbrl=1e4")),

@@ -106,7 +106,7 @@ def test_model_with_a_wrong_field_is_refused_by_the_command_in_words(
 
 
 def test_arguments_that_do_not_fit_the_model_are_not_called_damage(saved: Path, make_point_mass: Any) -> None:
-    with pytest.raises(ConfigError, match="observations of the environment"):
+    with pytest.raises(ConfigError, match="spaces do not match"):
         OfflineDCE.load(saved, env=make_point_mass())
     with pytest.raises(ConfigError, match="policy kwargs do not equal"):
         OfflineDCE.load(saved, policy_kwargs={"net_arch": [9]})

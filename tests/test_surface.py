@@ -83,7 +83,7 @@ def test_an_environment_with_other_actions_is_refused(
     model = OfflineBC("MlpPolicy", dataset=transitions, policy_kwargs={"net_arch": [8]})
     model.save(tmp_path / "model.zip")
     env = Bounded(make_point_mass(), actions=2.0)
-    with pytest.raises(ConfigError, match=r"actions of the environment are Box\(-2.*those of the model Box\(-1.*action_scale"):
+    with pytest.raises(ConfigError, match=r"Action spaces do not match: Box\(-2.* environment, Box\(-1.* model.*action_scale"):
         model.set_env(env) if given_at == "set_env" else OfflineBC.load(tmp_path / "model.zip", env=env)
     before = model.observation_space
     several = DummyVecEnv([make_point_mass] * 2)
@@ -97,18 +97,14 @@ def test_a_model_is_not_evaluated_where_it_does_not_belong(transitions: Transiti
     model = OfflineBC("MlpPolicy", dataset=transitions, policy_kwargs={"net_arch": [8]})
     rollouts = make_rollouts(TINY, 1)
     assert rollouts is not None
-    message = (
-        r"observations of the environment are Box\(-inf, inf, \(17,\), float64\), those of the model Box\(-inf, inf, \(5,\)"
-    )
+    message = r"Observation spaces do not match: Box\(-inf, inf, \(17,\).* environment, Box\(-inf, inf, \(5,\).* model"
     with pytest.raises(ConfigError, match=message):
         evaluate(model, rollouts, seed=0)
     with pytest.raises(ConfigError, match=message):
         model.learn(1, callback=EvaluationCallback(rollouts, TINY, eval_freq=1))
     model.save(tmp_path / "model.zip")
     outcome = sb3_dce("evaluate", str(tmp_path / "model.zip"), "--dataset", TINY)
-    assert (
-        outcome.code == 2 and "those of the model Box(-inf, inf, (5,)" in outcome.stderr and "Traceback" not in outcome.stderr
-    )
+    assert outcome.code == 2 and "Observation spaces do not match" in outcome.stderr and "Traceback" not in outcome.stderr
 
 
 def test_a_mistyped_dataset_is_no_reason_to_evaluate_nothing() -> None:
@@ -406,8 +402,12 @@ def test_an_interrupted_population_keeps_what_it_has(transitions: Transitions, m
         return draw(*args)
 
     monkeypatch.setattr(population, "_draw", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        population.train(10)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # test workers may have another one
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            population.train(10)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert models[0]._n_updates == models[0].num_timesteps == population.n_updates == 3
     other = Population([make(AGENTS["BC"], dataset=transitions, seed=seed) for seed in (0, 1)])
     other.train(3)
