@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import zipfile
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -277,14 +276,6 @@ def test_member_whose_moments_overflowed_does_not_end_the_others(tmp_path: Path)
             batched.run()
     assert read_result(tmp_path / "0") is not None and read_result(tmp_path / "1") is None
     assert read_divergence(tmp_path / "1") is not None
-
-
-@pytest.fixture
-def ctrl_c() -> Iterator[None]:
-    """Python's own handler, which a process in the background of a script does not have."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 # -- interruptions -----------------------------------------------------------------------------------------------------

@@ -390,6 +390,7 @@ def test_a_member_that_was_trained_by_itself_is_no_member_any_more(transitions: 
             population.train(1)
 
 
+@pytest.mark.usefixtures("ctrl_c")
 def test_an_interrupted_population_keeps_what_it_has(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
     models = [make(AGENTS["BC"], dataset=transitions, seed=seed) for seed in (0, 1)]
     population = Population(models)
@@ -402,12 +403,8 @@ def test_an_interrupted_population_keeps_what_it_has(transitions: Transitions, m
         return draw(*args)
 
     monkeypatch.setattr(population, "_draw", interrupted)
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # test workers may have another one
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            population.train(10)
-    finally:
-        signal.signal(signal.SIGINT, before)
+    with pytest.raises(KeyboardInterrupt):
+        population.train(10)
     assert models[0]._n_updates == models[0].num_timesteps == population.n_updates == 3
     other = Population([make(AGENTS["BC"], dataset=transitions, seed=seed) for seed in (0, 1)])
     other.train(3)
