@@ -38,9 +38,9 @@ from sb3_dce.sb3_checks import (
     check_device,
     check_flags,
     check_logging,
-    check_policy_kwargs,
     check_spaces,
     named_env,
+    policy_arguments,
 )
 from sb3_dce.state import Storage, TrainState
 
@@ -270,10 +270,7 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         self.check_parameters()
         self._stats_window_size = self.stats_window_size
         given, settings = self.policy_kwargs, self.policy_settings()
-        check_policy_kwargs(given, self.policy_class, settings)
-        says_nothing = (("net_arch", None), ("use_sde", False))
-        chosen = {name: value for name, value in given.items() if not any(name == n and value is v for n, v in says_nothing)}
-        self.policy_kwargs = {**settings, **chosen}
+        self.policy_kwargs = policy_arguments(given, self.policy_class, settings)
         try:
             super()._setup_model()
         finally:

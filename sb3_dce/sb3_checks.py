@@ -81,11 +81,12 @@ def named_env(env: GymEnv | str, verbose: int) -> GymEnv:
         raise ConfigError(f"no environment {env!r}: {error}", key="env", hint=hint) from error
 
 
-def check_policy_kwargs(given: Any, policy_class: type, settings: dict[str, Any]) -> None:
+def policy_arguments(given: Any, policy_class: type, settings: dict[str, Any]) -> dict[str, Any]:
     """
     :param given: the user's ``policy_kwargs``
     :param policy_class: policy they are for
     :param settings: arguments of the policy that the agent's own parameters decide
+    :return: arguments of the policy
     :raises ConfigError: for something that is no dictionary, an unknown name, or one that the agent decides
     """
     if not isinstance(given, dict):
@@ -96,10 +97,10 @@ def check_policy_kwargs(given: Any, policy_class: type, settings: dict[str, Any]
         hint = "Derive it from the agent's own policy (sb3_dce.policies), which 'MlpPolicy' stands for."
         what = f"{policy_class.__name__} does not take {', '.join(foreign)}, which this agent gives to its policy"
         raise ConfigError(what, key="policy", hint=hint)
+    # What says nothing: a default that is named, and what SB3's own algorithms write into a dictionary they share with us.
+    given = {n: v for n, v in given.items() if not (n == "net_arch" and v is None) and not (n == "use_sde" and v is False)}
     known = [name for name in parameters if name not in ("observation_space", "action_space", "lr_schedule", "use_sde")]
     for name, value in given.items():
-        if name == "use_sde" and value is False:  # SB3's own algorithms write it into a dictionary they share with us
-            continue
         if name not in parameters:
             hint = f"It has {', '.join(known)}."
             raise ConfigError(f"{policy_class.__name__} has no parameter {name!r}", where="policy_kwargs", key=name, hint=hint)
@@ -111,7 +112,7 @@ def check_policy_kwargs(given: Any, policy_class: type, settings: dict[str, Any]
         if name in AGENTS_CHOICE or (name in settings and name not in ("net_arch", "features_extractor_class")):
             hint = "It follows from the agent's own parameters: set it there, or leave it out."
             raise ConfigError(f"{name}={value!r} in policy_kwargs would contradict the agent", key=name, hint=hint)
-        if name == "net_arch" and value is not None:
+        if name == "net_arch":
             _check_net_arch(value)
         if name == "activation_fn" and not callable(value):
             hint = "For example torch.nn.Tanh."
@@ -126,6 +127,7 @@ def check_policy_kwargs(given: Any, policy_class: type, settings: dict[str, Any]
         if name == "optimizer_kwargs" and value is not None and (not isinstance(value, dict) or "lr" in value):
             hint = "For example {'eps': 1e-5}; the learning rate is the agent's learning_rate."
             raise ConfigError(f"optimizer_kwargs must be a dictionary without 'lr', got {value!r}", key=name, hint=hint)
+    return {**settings, **given}
 
 
 def _check_net_arch(value: Any) -> None:
