@@ -200,11 +200,13 @@ def rollouts_of(dataset: str | None, n_episodes: int, n_envs: int | None = None)
         return make_rollouts(dataset_id, n_episodes, n_envs)
     if dataset is not None and not is_path(dataset) and not is_minari_name(dataset):
         resolve(dataset)  # which says what is known
-    if dataset is None or own_env(dataset) is None:
+    first = None if dataset is None else own_env(dataset)
+    if dataset is None or first is None:
         return None
+    made = [first]  # what was made to find out is the first that is used
 
     def make_env() -> gym.Env:
-        env = own_env(dataset)
+        env = made.pop() if made else own_env(dataset)
         assert env is not None
         return env
 
