@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.buffers import OfflineReplayBuffer
-from sb3_dce.checks import check_choice, check_number, check_seed, check_steps
+from sb3_dce.checks import check_choice, check_number, check_optional, check_seed, check_steps
 from sb3_dce.diagnostics import RECORDED, DiagnosticsMixin
 from sb3_dce.envs import SpacesEnv
 from sb3_dce.errors import ConfigError
@@ -65,6 +65,7 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
     :param tau: Polyak coefficient of the targets (the paper's upsilon)
     :param gamma: discount factor in [0, 1]
     :param gradient_steps: gradient steps per call of ``train()``; the callbacks' frequencies must be multiples of it
+    :param max_grad_norm: clip the gradient of each network, all critics together, to this norm; ``None`` is off
     :param d4rl_compat: use exactly the rows of D4RL's ``qlearning_dataset``
     :param normalize_obs: standardise observations with the dataset's mean and deviation, kept in the saved networks
     :param reward_normalization: ``"iql"`` multiplies rewards by 1000 / (largest - smallest episode return)
@@ -96,6 +97,7 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         tau: float = 0.005,
         gamma: float = 0.99,
         gradient_steps: int,
+        max_grad_norm: float | None = None,
         d4rl_compat: bool,
         normalize_obs: bool,
         reward_normalization: str | None = None,
@@ -144,6 +146,7 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
             sde_support=False,
         )
         self.algo = self.algo_name  # tells whose file a saved model is
+        self.max_grad_norm = max_grad_norm
         self.normalize_obs = normalize_obs
         self.reward_normalization = reward_normalization
         self.reward_scale = reward_scale
@@ -245,6 +248,7 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         check_flags(self)
         check_number("batch_size", self.batch_size, 1, integer=True)
         check_number("gradient_steps", self.gradient_steps, 1, integer=True)
+        check_optional("max_grad_norm", self.max_grad_norm)
         check_number("tau", self.tau, 0, 1, hint="Usual is 0.005. The paper's tau is the expectile.")
         check_number("gamma", self.gamma, 0, 1)
         check_number("reward_scale", self.reward_scale, 0, open_low=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,15 +14,24 @@ from sb3_dce import losses
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.buffers import OfflineReplayBuffer
-from sb3_dce.checks import check_choice, check_number, check_optional
+from sb3_dce.checks import check_choice, check_number
 from sb3_dce.data.selection import rows_of_best_episodes
 from sb3_dce.data.transitions import Transitions
 from sb3_dce.errors import ConfigError
-from sb3_dce.execution import Update
+from sb3_dce.execution import Update, UpdateOptions, bound_update
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import ActorPolicy
 from sb3_dce.state import PureNet, Storage
 from sb3_dce.steps import descend
+
+
+@dataclass(frozen=True)
+class BCOptions(UpdateOptions):
+    """
+    :param likelihood: maximise the likelihood instead of the squared error
+    """
+
+    likelihood: bool
 
 
 class OfflineBC(OfflineAlgorithm):
@@ -34,7 +44,6 @@ class OfflineBC(OfflineAlgorithm):
         log-probabilities need actions inside (-1, 1), so data are clipped to +-(1 - 1e-5) there
     :param fraction: clone only this share of the whole episodes, the best by undiscounted return (0.1 is "10 % BC"); 1.0 uses
         all rows. The chosen rows are copied
-    :param max_grad_norm: clip the gradient to this norm; ``None`` is off
     """
 
     algo_name: ClassVar[str] = "offline_bc"
@@ -73,6 +82,7 @@ class OfflineBC(OfflineAlgorithm):
             learning_rate,
             batch_size=batch_size,
             gradient_steps=gradient_steps,
+            max_grad_norm=max_grad_norm,
             d4rl_compat=d4rl_compat,
             normalize_obs=normalize_obs,
             execution=execution,
@@ -87,7 +97,6 @@ class OfflineBC(OfflineAlgorithm):
         )
         self.bc_loss = bc_loss
         self.fraction = fraction
-        self.max_grad_norm = max_grad_norm
         if _init_setup_model:
             self._setup_model()
 
@@ -95,7 +104,6 @@ class OfflineBC(OfflineAlgorithm):
         super().check_parameters()
         check_choice("bc_loss", self.bc_loss, ("mse", "nll"))
         check_number("fraction", self.fraction, 0, 1, open_low=True, hint="0.1 clones the best tenth of the episodes.")
-        check_optional("max_grad_norm", self.max_grad_norm)
 
     def chosen_rows(self, transitions: Transitions) -> np.ndarray | None:
         return rows_of_best_episodes(transitions, self.fraction) if self.fraction < 1.0 else None
@@ -110,47 +118,43 @@ class OfflineBC(OfflineAlgorithm):
         super()._take_statistics_of(buffer)
 
     def make_update(self, storages: dict[str, Storage]) -> Update:
-        net, settings = PureNet(self.actor, "get_action_dist_params"), storages["actor"].settings
-        likelihood, max_grad_norm = self.bc_loss == "nll", self.max_grad_norm
-
-        def bc_update(state: Any, batch: Any, noise: Any, coef: Any) -> Any:
-            return update(likelihood, max_grad_norm, net, settings, state, batch, coef)
-
-        return bc_update
+        options = BCOptions(max_grad_norm=self.max_grad_norm, likelihood=self.bc_loss == "nll")
+        return bound_update(update, options, {"actor": PureNet(self.actor, "get_action_dist_params")}, storages)
 
     def noise_specs(self, batch_size: int) -> dict[str, NoiseSpec]:
         return {}
 
 
 def update(
-    likelihood: bool,
-    max_grad_norm: float | None,
-    net: PureNet,
-    settings: Any,
+    options: BCOptions,
+    nets: dict[str, PureNet],
+    settings: dict[str, Any],
     state: dict[str, Any],
     batch: ReplayBufferSamples,
+    noise: dict[str, th.Tensor],
     coef: dict[str, th.Tensor],
 ) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
     """
     One gradient step of behavioural cloning.
 
-    :param likelihood: maximise the likelihood instead of the squared error
-    :param max_grad_norm: clip the gradient to this norm
-    :param net: actor as a function of its flat parameters
-    :param settings: optimizer constants
+    :param options: choices fixed at trace time
+    :param nets: the actor as a function of its flat parameters
+    :param settings: optimizer constants of each learner
     :param state: learner "actor"
     :param batch: tensors of shape (batch, ...); actions scaled to [-1, 1]
+    :param noise: none is needed
     :param coef: 0-dimensional coefficients
     :return: changed parts of the state, metrics
     """
 
     def loss(params: th.Tensor) -> tuple[th.Tensor, tuple[th.Tensor, th.Tensor]]:
-        mean, log_std, _ = net(params, batch.observations)
-        if likelihood:
+        mean, log_std, _ = nets["actor"](params, batch.observations)
+        if options.likelihood:
             return losses.bc_nll(mean, log_std, batch.actions), (mean, log_std)
         return losses.bc_mse(th.tanh(mean), batch.actions), (mean, log_std)
 
-    actor, value, (mean, log_std), norm = descend(loss, state["actor"], coef["learning_rate"], settings, max_grad_norm)
+    lr, clip = coef["learning_rate"], options.max_grad_norm
+    actor, value, (mean, log_std), norm = descend(loss, state["actor"], lr, settings["actor"], clip)
     metrics = {"bc_loss": value, "actor_loss": value, "grad_norm_actor": norm}
     metrics["action_dist"] = (th.tanh(mean) - batch.actions).abs().mean()
     metrics["log_std"] = log_std.mean()

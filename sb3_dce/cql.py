@@ -15,10 +15,10 @@ from sb3_dce import losses
 from sb3_dce.actor_rate import ActorLearningRate
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
-from sb3_dce.checks import check_choice, check_number, check_optional
+from sb3_dce.checks import check_choice, check_number
 from sb3_dce.ensembles import EnsembleNet
 from sb3_dce.entropy import EntropyCoefficient, stepped_ent_coef
-from sb3_dce.execution import Update
+from sb3_dce.execution import Update, UpdateOptions, bound_update
 from sb3_dce.networks import OfflineCritic
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import OfflineSACPolicy
@@ -33,13 +33,12 @@ MAX_LAGRANGE = 1e6
 
 
 @dataclass(frozen=True)
-class CQLOptions:
+class CQLOptions(UpdateOptions):
     """Choices of :func:`update` that are fixed when it is traced; see :class:`OfflineCQL` for their meaning."""
 
     lagrange: bool
     lagrange_form: str
     actor_q_timing: str
-    max_grad_norm: float | None
 
 
 class OfflineCQL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
@@ -69,7 +68,6 @@ class OfflineCQL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
     :param policy_eval_start: updates at the start in which the actor clones the data instead of following Q
     :param actor_q_timing: critics of the actor loss: ``"previous"`` (before their step of this update, authors) or
         ``"updated"``
-    :param max_grad_norm: clip each network's gradient to this norm; ``None`` is off
     """
 
     algo_name: ClassVar[str] = "offline_cql"
@@ -127,6 +125,7 @@ class OfflineCQL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
             tau=tau,
             gamma=gamma,
             gradient_steps=gradient_steps,
+            max_grad_norm=max_grad_norm,
             d4rl_compat=d4rl_compat,
             normalize_obs=normalize_obs,
             reward_normalization=reward_normalization,
@@ -152,7 +151,6 @@ class OfflineCQL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
         self.max_q_backup = max_q_backup
         self.policy_eval_start = policy_eval_start
         self.actor_q_timing = actor_q_timing
-        self.max_grad_norm = max_grad_norm
         if _init_setup_model:
             self._setup_model()
 
@@ -167,7 +165,6 @@ class OfflineCQL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
         check_choice("lagrange_form", self.lagrange_form, LAGRANGE_FORMS)
         check_number("policy_eval_start", self.policy_eval_start, 0, integer=True)
         check_choice("actor_q_timing", self.actor_q_timing, ACTOR_Q_TIMINGS)
-        check_optional("max_grad_norm", self.max_grad_norm)
 
     def policy_settings(self) -> dict[str, Any]:
         return {**super().policy_settings(), "net_arch": [256, 256, 256]}
@@ -198,20 +195,18 @@ class OfflineCQL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
     # -- what the base class needs ---------------------------------------------------------------------------------
 
     def make_update(self, storages: dict[str, Storage]) -> Update:
-        actor = PureNet(self.actor, "get_action_dist_params")
-        critic, critic_target = EnsembleNet(self.critic), EnsembleNet(self.critic_target)
-        settings = {name: s.settings for name, s in storages.items() if s.settings is not None}
+        nets = {
+            "actor": PureNet(self.actor, "get_action_dist_params"),
+            "critic": EnsembleNet(self.critic),
+            "critic_target": EnsembleNet(self.critic_target),
+        }
         options = CQLOptions(
             lagrange=LAGRANGE in storages,
             lagrange_form=self.lagrange_form,
             actor_q_timing=self.actor_q_timing,
             max_grad_norm=self.max_grad_norm,
         )
-
-        def cql_update(state: Any, batch: Any, noise: Any, coef: Any, clone: bool) -> Any:
-            return update(options, actor, critic, critic_target, settings, state, batch, noise, coef, clone)
-
-        return cql_update
+        return bound_update(update, options, nets, storages)
 
     def update_variant(self, n_updates: int) -> dict[str, Any]:
         return {"clone": n_updates < self.policy_eval_start}
@@ -240,9 +235,7 @@ class OfflineCQL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
 
 def update(
     options: CQLOptions,
-    actor: PureNet,
-    critic: EnsembleNet,
-    critic_target: EnsembleNet,
+    nets: dict[str, Any],
     settings: dict[str, Any],
     state: dict[str, Any],
     batch: ReplayBufferSamples,
@@ -257,9 +250,7 @@ def update(
     :func:`~sb3_dce.steps.descend` looks at its argument only.
 
     :param options: choices fixed at trace time
-    :param actor: actor as a function of its flat parameters
-    :param critic: critics as a function of their flat parameters
-    :param critic_target: the same of the targets
+    :param nets: networks as functions of their flat parameters
     :param settings: optimizer constants of each learner
     :param state: learners "actor", "critic", "log_ent_coef", "log_lagrange" and the flat target
     :param batch: tensors of shape (batch, ...); actions scaled to [-1, 1]
@@ -270,8 +261,8 @@ def update(
     """
     s, a, s2, d = batch.observations, batch.actions, batch.next_observations, batch.dones
     r = coef["reward_scale"] * batch.rewards + coef["reward_shift"]
-    mean, log_std, _ = actor(state["actor"].params, s)
-    mean2, log_std2, _ = actor(state["actor"].params, s2)
+    mean, log_std, _ = nets["actor"](state["actor"].params, s)
+    mean2, log_std2, _ = nets["actor"](state["actor"].params, s2)
 
     # 1 temperature; alpha is the value after its step
     a_pi, log_prob = losses.squashed_gaussian(mean, log_std, noise["actor"])
@@ -280,7 +271,7 @@ def update(
 
     # 2 target: each critic's best action, then the smallest critic
     a2, _ = losses.squashed_gaussian(mean2, log_std2, noise["next_actor"])
-    q_next = _of_actions(critic_target(state["critic_target"], _repeated(s2, len(a2)), a2.flatten(0, 1)), len(a2))
+    q_next = _of_actions(nets["critic_target"](state["critic_target"], _repeated(s2, len(a2)), a2.flatten(0, 1)), len(a2))
     next_values = q_next.amax(dim=-3).amin(dim=-3)
     y = losses.td_target(r, d, next_values, coef["gamma"])
 
@@ -296,7 +287,7 @@ def update(
     multiplier = state[LAGRANGE].params.exp().clamp(0.0, MAX_LAGRANGE) if options.lagrange else None
 
     def q_loss(params: th.Tensor) -> tuple[th.Tensor, tuple[th.Tensor, th.Tensor, th.Tensor]]:
-        q_all = critic(params, states, actions)
+        q_all = nets["critic"](params, states, actions)
         q_data, q_sampled = q_all[..., :n, :], _of_actions(q_all[..., n:, :], len(sampled))
         gaps = losses.cql_gap(q_data, q_sampled, log_densities)
         td = losses.mean_square(q_data, y)
@@ -323,11 +314,12 @@ def update(
     critic_params = (state if options.actor_q_timing == "previous" else new)["critic"].params
 
     def pi_loss(params: th.Tensor) -> tuple[th.Tensor, tuple[()]]:
-        mean, log_std, _ = actor(params, s)
+        mean, log_std, _ = nets["actor"](params, s)
         actions, log_prob = losses.squashed_gaussian(mean, log_std, noise["actor"])
         if clone:
             return losses.batch_mean(ent_coef * log_prob) + losses.bc_nll(mean, log_std, a), ()
-        return losses.sac_actor_loss(log_prob, critic(critic_params, s, actions).amin(dim=-3), ent_coef), ()
+        q_pi = nets["critic"](critic_params, s, actions)
+        return losses.sac_actor_loss(log_prob, q_pi.amin(dim=-3), ent_coef), ()
 
     rate = coef["actor_learning_rate"]
     new["actor"], loss, _, norm = descend(pi_loss, state["actor"], rate, settings["actor"], clip)

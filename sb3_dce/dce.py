@@ -16,7 +16,7 @@ from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.checks import check_choice, check_number, check_optional
 from sb3_dce.entropy import ENT_COEF, EntropyCoefficient, descend_ent_coef
 from sb3_dce.errors import ConfigError
-from sb3_dce.execution import Update
+from sb3_dce.execution import Update, UpdateOptions, bound_update
 from sb3_dce.hyperparams import constructor_parameters
 from sb3_dce.networks import OfflineCritic, ValueNet
 from sb3_dce.noise import NoiseSpec
@@ -32,7 +32,7 @@ REDUCTIONS = ("min", "mean", "first")
 
 
 @dataclass(frozen=True)
-class DCEOptions:
+class DCEOptions(UpdateOptions):
     """Choices of :func:`update` that are fixed when it is traced; see :class:`OfflineDCE` for their meaning."""
 
     use_v: bool
@@ -47,7 +47,6 @@ class DCEOptions:
     v_target_timing: str
     actor_q: str
     q_target_clip: float | None
-    max_grad_norm: float | None
     n_masks: tuple[int, int]  # critics, hidden layers with dropout; (0, 0) without dropout
     dropout_in_target: bool
 
@@ -92,7 +91,6 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
     :param dropout_in_target: also drop units of the target critics
     :param critic_layer_norm: layer normalisation in the critics
     :param critic_weight_decay: L2 coefficient of the critics' optimizer
-    :param max_grad_norm: clip each network's gradient to this norm; ``None`` is off
     :param q_target_clip: clip the TD target to [-q_target_clip, q_target_clip]; ``None`` is off
     """
 
@@ -170,6 +168,7 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
             tau=tau,
             gamma=gamma,
             gradient_steps=gradient_steps,
+            max_grad_norm=max_grad_norm,
             d4rl_compat=d4rl_compat,
             normalize_obs=normalize_obs,
             reward_normalization=reward_normalization,
@@ -209,7 +208,6 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
         self.dropout_in_target = dropout_in_target
         self.critic_layer_norm = critic_layer_norm
         self.critic_weight_decay = critic_weight_decay
-        self.max_grad_norm = max_grad_norm
         self.q_target_clip = q_target_clip
         if _init_setup_model:
             self._setup_model()
@@ -230,7 +228,6 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
         check_number("critic_weight_decay", self.critic_weight_decay, 0)
         if self.penalty_floor is not None:
             check_number("penalty_floor", self.penalty_floor, -float("inf"), open_low=True, hint="None switches it off.")
-        check_optional("max_grad_norm", self.max_grad_norm)
         check_optional("q_target_clip", self.q_target_clip)
         check_choice("penalty_action_source", self.penalty_action_source, PENALTY_SOURCES)
         check_choice("penalty_form", self.penalty_form, PENALTY_FORMS)
@@ -278,7 +275,6 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
         }
         if self.value_net is not None:
             nets["value_net"] = PureNet(self.value_net)
-        settings = {name: s.settings for name, s in storages.items() if s.settings is not None}
         options = DCEOptions(
             use_v=self.use_v,
             use_target_v=self.use_target_v,
@@ -296,11 +292,7 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
             n_masks=self._n_masks(),
             dropout_in_target=self.dropout_in_target,
         )
-
-        def dce_update(state: Any, batch: Any, noise: Any, coef: Any, with_actor: bool) -> Any:
-            return update(options, nets, settings, state, batch, noise, coef, with_actor)
-
-        return dce_update
+        return bound_update(update, options, nets, storages)
 
     def update_variant(self, n_updates: int) -> dict[str, Any]:
         return {"with_actor": (n_updates + 1) % self.policy_update_freq == 0}

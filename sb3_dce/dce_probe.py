@@ -153,7 +153,7 @@ class OfflineDCEProbe(OfflineDCE):
         actor, critic = PureNet(self.actor, "get_action_dist_params"), PureNet(self.critic)
 
         def probe_update(state: Any, batch: Any, noise: Any, coef: Any, with_actor: bool) -> Any:
-            new, metrics = dce_update(state, batch, noise, coef, with_actor)
+            new, metrics = dce_update(state, batch, noise, coef, with_actor=with_actor)
             s = batch.observations
             actions = [th.tanh(actor(state[f"actor_{name}"], s)[0]) for name in PROBE_POLICIES]
             for beta in (0, *PROBE_BETAS):
@@ -162,7 +162,7 @@ class OfflineDCEProbe(OfflineDCE):
                 if beta:
                     own = {"actor": state["actor"], **{network: state[name] for network, name in names.items()}}
                     weights = {"beta": coef[f"beta_{beta}"], "beta_eff": coef[f"beta_eff_{beta}"]}
-                    changed, found = dce_update(own, batch, noise, {**coef, **weights}, False)
+                    changed, found = dce_update(own, batch, noise, {**coef, **weights}, with_actor=False)
                     new.update({name: changed[network] for network, name in names.items()})
                 params = state[names["critic"]].params
                 q_ood = [th.cat(critic(params, s, a), dim=-1).mean(dim=-1, keepdim=True) for a in actions]

@@ -72,7 +72,15 @@ class DatasetSecurityError(DatasetError):
 
 
 class DatasetSemanticsError(DatasetError):
-    """The file is readable but its numbers mean nothing sensible."""
+    """
+    The file is readable but its numbers mean nothing sensible. Parameters not listed here as in :class:`SB3DCEError`.
+
+    :param check: which check of ``sb3-dce datasets check`` refuses them
+    """
+
+    def __init__(self, what: str, *, check: str = "readable", **facts: Any) -> None:
+        super().__init__(what, **facts)
+        self.check = check
 
 
 class DownloadError(SB3DCEError, OSError):

@@ -14,6 +14,8 @@ import sys
 import sysconfig
 import warnings
 from collections.abc import Callable, Hashable, Iterator
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -23,9 +25,36 @@ from torch.utils._pytree import tree_leaves
 from sb3_dce.capture import CapturedStep, Draw, StaticInputs, Step
 from sb3_dce.errors import DivergenceError, SB3DCEWarning
 from sb3_dce.metric_sums import MetricSums
+from sb3_dce.state import Storage
 
 # (state tree, batch, noise, coefficients) -> (new state tree, metrics), see the ``update`` of an algorithm.
 Update = Callable[..., tuple[dict[str, Any], dict[str, th.Tensor]]]
+
+
+@dataclass(frozen=True)
+class UpdateOptions:
+    """
+    Choices of an update that are fixed when it is traced. Those of one algorithm alone are in a subclass beside its update.
+
+    :param max_grad_norm: clip each network's gradient to this norm; ``None`` is off
+    """
+
+    max_grad_norm: float | None
+
+
+def bound_update(
+    update: Callable[..., Any], options: UpdateOptions, nets: dict[str, Any], storages: dict[str, Storage]
+) -> Update:
+    """
+    :param update: pure update of an algorithm, ``update(options, nets, settings, state, batch, noise, coef, **variant)``
+    :param options: choices fixed at trace time
+    :param nets: networks as functions of their flat parameters, by name
+    :param storages: of the networks and of further learners, whose optimizers have the settings
+    :return: the same of state, batch, noise and coefficients only
+    """
+    settings = {name: storage.settings for name, storage in storages.items() if storage.settings is not None}
+    return partial(update, options, nets, settings)
+
 
 Variant = tuple[tuple[str, Any], ...]
 

@@ -14,8 +14,8 @@ from sb3_dce import losses
 from sb3_dce.actors import GaussianActor
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
-from sb3_dce.checks import check_choice, check_number, check_optional
-from sb3_dce.execution import Update
+from sb3_dce.checks import check_choice, check_number
+from sb3_dce.execution import Update, UpdateOptions, bound_update
 from sb3_dce.networks import OfflineCritic, ValueNet
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import OfflineIQLPolicy
@@ -27,15 +27,11 @@ ACTION_LIMIT = 1.0 - 1e-5
 
 
 @dataclass(frozen=True)
-class IQLOptions:
+class IQLOptions(UpdateOptions):
     """
-    Choices of :func:`update` that are fixed when it is traced.
-
-    :param max_grad_norm: clip each network's gradient to this norm
     :param n_masks: hidden layers of the actor with dropout; 0 without dropout
     """
 
-    max_grad_norm: float | None
     n_masks: int
 
 
@@ -58,7 +54,6 @@ class OfflineIQL(OfflineAlgorithm):
     :param actor_dropout: dropout after each hidden activation of the actor while training: 0.1 on Adroit and Kitchen
     :param actor_lr_schedule: ``"cosine"`` lowers the actor's learning rate from ``learning_rate`` to 0 over the
         ``total_timesteps`` of ``learn()``; ``"constant"`` leaves it
-    :param max_grad_norm: clip each network's gradient to this norm; ``None`` is off
     """
 
     algo_name: ClassVar[str] = "offline_iql"
@@ -111,6 +106,7 @@ class OfflineIQL(OfflineAlgorithm):
             tau=tau,
             gamma=gamma,
             gradient_steps=gradient_steps,
+            max_grad_norm=max_grad_norm,
             d4rl_compat=d4rl_compat,
             normalize_obs=normalize_obs,
             reward_normalization=reward_normalization,
@@ -131,7 +127,6 @@ class OfflineIQL(OfflineAlgorithm):
         self.max_weight = max_weight
         self.actor_dropout = actor_dropout
         self.actor_lr_schedule = actor_lr_schedule
-        self.max_grad_norm = max_grad_norm
         if _init_setup_model:
             self._setup_model()
 
@@ -142,7 +137,6 @@ class OfflineIQL(OfflineAlgorithm):
         check_number("max_weight", self.max_weight, 0, open_low=True)
         check_number("actor_dropout", self.actor_dropout, 0, 1, open_high=True)
         check_choice("actor_lr_schedule", self.actor_lr_schedule, ("cosine", "constant"))
-        check_optional("max_grad_norm", self.max_grad_norm)
 
     def policy_settings(self) -> dict[str, Any]:
         return {**super().policy_settings(), "use_v": True}
@@ -154,13 +148,8 @@ class OfflineIQL(OfflineAlgorithm):
             "critic_target": PureNet(self.critic_target),
             "value_net": PureNet(self.value_net),
         }
-        settings = {name: s.settings for name, s in storages.items() if s.settings is not None}
-        options = IQLOptions(self.max_grad_norm, len(self._dropout_widths()))
-
-        def iql_update(state: Any, batch: Any, noise: Any, coef: Any) -> Any:
-            return update(options, nets, settings, state, batch, noise, coef)
-
-        return iql_update
+        options = IQLOptions(max_grad_norm=self.max_grad_norm, n_masks=len(self._dropout_widths()))
+        return bound_update(update, options, nets, storages)
 
     def noise_specs(self, batch_size: int) -> dict[str, NoiseSpec]:
         widths = self._dropout_widths()

@@ -14,10 +14,10 @@ from sb3_dce import losses
 from sb3_dce.actor_rate import ActorLearningRate
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
-from sb3_dce.checks import check_number, check_optional
+from sb3_dce.checks import check_number
 from sb3_dce.ensembles import EnsembleNet, EnsemblePolicy
 from sb3_dce.entropy import EntropyCoefficient, stepped_ent_coef
-from sb3_dce.execution import Update
+from sb3_dce.execution import Update, UpdateOptions, bound_update
 from sb3_dce.networks import OfflineCritic
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.ood_weight import OOD_Q, OODWeight
@@ -26,13 +26,12 @@ from sb3_dce.steps import action_metrics, descend, polyak, q_data_metrics
 
 
 @dataclass(frozen=True)
-class PBRLOptions:
+class PBRLOptions(UpdateOptions):
     """Choices of :func:`update` that are fixed when it is traced; see :class:`OfflinePBRL` for their meaning."""
 
     prior_scale: float
     pseudo_target_floor: float | None
     record: bool
-    max_grad_norm: float | None
 
 
 class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OODWeight, OfflineAlgorithm):
@@ -70,7 +69,6 @@ class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OODWeight, OfflineAlgor
     :param steps_per_epoch: gradient steps in one epoch
     :param pseudo_target_floor: smallest pseudo-target, reward units (authors: 0); ``None`` is off
     :param prior_scale: scale of a frozen random network added to each critic (PBRL-prior: 1); 0 is off
-    :param max_grad_norm: clip each network's gradient to this norm, all critics together; ``None`` is off
     """
 
     algo_name: ClassVar[str] = "offline_pbrl"
@@ -133,6 +131,7 @@ class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OODWeight, OfflineAlgor
             tau=tau,
             gamma=gamma,
             gradient_steps=gradient_steps,
+            max_grad_norm=max_grad_norm,
             d4rl_compat=d4rl_compat,
             normalize_obs=normalize_obs,
             reward_normalization=reward_normalization,
@@ -164,7 +163,6 @@ class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OODWeight, OfflineAlgor
         self.steps_per_epoch = steps_per_epoch
         self.pseudo_target_floor = pseudo_target_floor
         self.prior_scale = prior_scale
-        self.max_grad_norm = max_grad_norm
         if _init_setup_model:
             self._setup_model()
 
@@ -178,7 +176,6 @@ class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OODWeight, OfflineAlgor
         check_number("n_ood_actions", self.n_ood_actions, 1, integer=True)
         if self.pseudo_target_floor is not None:
             check_number("pseudo_target_floor", self.pseudo_target_floor, -float("inf"), open_low=True)
-        check_optional("max_grad_norm", self.max_grad_norm)
 
     def policy_settings(self) -> dict[str, Any]:
         return {
@@ -191,22 +188,20 @@ class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OODWeight, OfflineAlgor
     # -- what the base class needs ---------------------------------------------------------------------------------
 
     def make_update(self, storages: dict[str, Storage]) -> Update:
-        actor = PureNet(self.actor, "get_action_dist_params")
-        critics = {"critic": EnsembleNet(self.critic), "critic_target": EnsembleNet(self.critic_target)}
+        nets = {
+            "actor": PureNet(self.actor, "get_action_dist_params"),
+            "critic": EnsembleNet(self.critic),
+            "critic_target": EnsembleNet(self.critic_target),
+        }
         if self.critic_prior is not None:
-            critics["critic_prior"] = EnsembleNet(self.critic_prior)
-        settings = {name: s.settings for name, s in storages.items() if s.settings is not None}
+            nets["critic_prior"] = EnsembleNet(self.critic_prior)
         options = PBRLOptions(
             prior_scale=self.prior_scale,
             pseudo_target_floor=self.pseudo_target_floor,
             record=OOD_Q in storages,
             max_grad_norm=self.max_grad_norm,
         )
-
-        def pbrl_update(state: Any, batch: Any, noise: Any, coef: Any) -> Any:
-            return update(options, actor, critics, settings, state, batch, noise, coef)
-
-        return pbrl_update
+        return bound_update(update, options, nets, storages)
 
     def noise_specs(self, batch_size: int) -> dict[str, NoiseSpec]:
         one = (batch_size, get_action_dim(self.action_space))
@@ -228,8 +223,7 @@ class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OODWeight, OfflineAlgor
 
 def update(
     options: PBRLOptions,
-    actor: PureNet,
-    critics: dict[str, EnsembleNet],
+    nets: dict[str, Any],
     settings: dict[str, Any],
     state: dict[str, Any],
     batch: ReplayBufferSamples,
@@ -240,8 +234,7 @@ def update(
     One gradient step of PBRL, in the authors' order: temperature, critics, actor on the new critics, targets.
 
     :param options: choices fixed at trace time
-    :param actor: actor as a function of its flat parameters
-    :param critics: "critic", "critic_target" and with priors "critic_prior" as functions of their flat parameters
+    :param nets: networks as functions of their flat parameters, with priors "critic_prior" among them
     :param settings: optimizer constants of each learner
     :param state: learners "actor", "critic", "log_ent_coef", flat targets and priors, recorded value
     :param batch: tensors of shape (batch, ...); actions scaled to [-1, 1]
@@ -251,13 +244,13 @@ def update(
     """
     s, a, s2, d = batch.observations, batch.actions, batch.next_observations, batch.dones
     r = coef["reward_scale"] * batch.rewards + coef["reward_shift"]
-    mean, log_std, _ = actor(state["actor"].params, s)
-    mean2, log_std2, _ = actor(state["actor"].params, s2)
+    mean, log_std, _ = nets["actor"](state["actor"].params, s)
+    mean2, log_std2, _ = nets["actor"](state["actor"].params, s2)
 
     def prior(obs: th.Tensor, actions: th.Tensor) -> th.Tensor | float:
         if options.prior_scale == 0:
             return 0.0
-        return options.prior_scale * critics["critic_prior"](state["critic_prior"], obs, actions)
+        return options.prior_scale * nets["critic_prior"](state["critic_prior"], obs, actions)
 
     # 1 temperature; alpha is the value after its step
     a_pi, log_prob = losses.squashed_gaussian(mean, log_std, noise["actor"])
@@ -266,7 +259,7 @@ def update(
 
     # 2 targets, one per critic
     a2, _ = losses.squashed_gaussian(mean2, log_std2, noise["next_actor"])
-    q_next = critics["critic_target"](state["critic_target"], s2, a2) + prior(s2, a2)
+    q_next = nets["critic_target"](state["critic_target"], s2, a2) + prior(s2, a2)
     next_uncertainty = losses.ensemble_std(q_next)
     next_values = losses.pessimistic_values(q_next, next_uncertainty, coef["uncertainty_coef"])
     y = losses.td_target(r, d, next_values, coef["gamma"])
@@ -280,7 +273,7 @@ def update(
     q_prior = prior(states, actions)
 
     def q_loss(params: th.Tensor) -> tuple[th.Tensor, tuple[th.Tensor, ...]]:
-        q_all = critics["critic"](params, states, actions) + q_prior
+        q_all = nets["critic"](params, states, actions) + q_prior
         q_data, q_ood = q_all[..., :n, :], q_all[..., n:, :]
         pseudo_targets = _pseudo_targets(options, q_ood.detach(), n_ood, coef)
         td = losses.mean_square(q_data, y)
@@ -299,9 +292,9 @@ def update(
 
     # 4 actor on the new critics
     def pi_loss(params: th.Tensor) -> tuple[th.Tensor, tuple[()]]:
-        mean, log_std, _ = actor(params, s)
+        mean, log_std, _ = nets["actor"](params, s)
         actions, log_prob = losses.squashed_gaussian(mean, log_std, noise["actor"])
-        q_pi = critics["critic"](new["critic"].params, s, actions) + prior(s, actions)
+        q_pi = nets["critic"](new["critic"].params, s, actions) + prior(s, actions)
         return losses.sac_actor_loss(log_prob, q_pi.amin(dim=-3), ent_coef), ()
 
     rate = coef["actor_learning_rate"]

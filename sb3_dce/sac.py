@@ -12,9 +12,8 @@ from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, S
 from sb3_dce import losses
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
-from sb3_dce.checks import check_optional
 from sb3_dce.entropy import ENT_COEF, EntropyCoefficient, descend_ent_coef
-from sb3_dce.execution import Update
+from sb3_dce.execution import Update, UpdateOptions, bound_update
 from sb3_dce.networks import OfflineCritic
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import OfflineSACPolicy
@@ -34,7 +33,6 @@ class OfflineSAC(EntropyCoefficient, OfflineAlgorithm):
 
     :param ent_coef: temperature: a number, ``"auto"``, or ``"auto_0.1"`` to start at 0.1
     :param target_entropy: entropy aimed at, in nats, when ``ent_coef`` is learned; ``"auto"`` is minus the action dimension
-    :param max_grad_norm: clip each network's gradient to this norm; ``None`` is off
     """
 
     algo_name: ClassVar[str] = "offline_sac"
@@ -81,6 +79,7 @@ class OfflineSAC(EntropyCoefficient, OfflineAlgorithm):
             tau=tau,
             gamma=gamma,
             gradient_steps=gradient_steps,
+            max_grad_norm=max_grad_norm,
             d4rl_compat=d4rl_compat,
             normalize_obs=normalize_obs,
             reward_normalization=reward_normalization,
@@ -98,13 +97,11 @@ class OfflineSAC(EntropyCoefficient, OfflineAlgorithm):
         )
         self.ent_coef = ent_coef
         self.target_entropy = target_entropy
-        self.max_grad_norm = max_grad_norm
         if _init_setup_model:
             self._setup_model()
 
     def check_parameters(self) -> None:
         super().check_parameters()
-        check_optional("max_grad_norm", self.max_grad_norm)
 
     def make_update(self, storages: dict[str, Storage]) -> Update:
         nets = {
@@ -112,13 +109,7 @@ class OfflineSAC(EntropyCoefficient, OfflineAlgorithm):
             "critic": PureNet(self.critic),
             "critic_target": PureNet(self.critic_target),
         }
-        settings = {name: s.settings for name, s in storages.items() if s.settings is not None}
-        max_grad_norm = self.max_grad_norm
-
-        def sac_update(state: Any, batch: Any, noise: Any, coef: Any) -> Any:
-            return update(max_grad_norm, nets, settings, state, batch, noise, coef)
-
-        return sac_update
+        return bound_update(update, UpdateOptions(self.max_grad_norm), nets, storages)
 
     def noise_specs(self, batch_size: int) -> dict[str, NoiseSpec]:
         shape = (batch_size, get_action_dim(self.action_space))
@@ -126,7 +117,7 @@ class OfflineSAC(EntropyCoefficient, OfflineAlgorithm):
 
 
 def update(
-    max_grad_norm: float | None,
+    options: UpdateOptions,
     nets: dict[str, PureNet],
     settings: dict[str, Any],
     state: dict[str, Any],
@@ -137,7 +128,7 @@ def update(
     """
     One gradient step of SAC, in the order of Stable-Baselines3: temperature, critics, actor, targets.
 
-    :param max_grad_norm: clip each network's gradient to this norm
+    :param options: choices fixed at trace time
     :param nets: networks as functions of their flat parameters
     :param settings: optimizer constants of each learner
     :param state: learners "actor", "critic", with a learned temperature "log_ent_coef", and the flat target
@@ -148,7 +139,7 @@ def update(
     """
     s, a, s2, d = batch.observations, batch.actions, batch.next_observations, batch.dones
     r = coef["reward_scale"] * batch.rewards + coef["reward_shift"]
-    lr = coef["learning_rate"]
+    lr, clip = coef["learning_rate"], options.max_grad_norm
     learned = ENT_COEF in state
     # the value before the temperature's own step, in target and actor loss alike
     ent_coef = state[ENT_COEF].params.exp() if learned else coef["ent_coef"]
@@ -165,7 +156,7 @@ def update(
         q_data = nets["critic"](params, s, a)
         return losses.critic_loss(q_data, y, 0.5), th.cat(list(q_data), dim=-1)
 
-    new["critic"], loss, q_data, norm = descend(q_loss, state["critic"], lr, settings["critic"], max_grad_norm)
+    new["critic"], loss, q_data, norm = descend(q_loss, state["critic"], lr, settings["critic"], clip)
     metrics = {"critic_loss": loss, "grad_norm_q": norm, "td_target": y.mean(), "value_next": next_values.mean()}
     metrics.update(q_data_metrics(q_data))
     metrics["td_mse"] = (q_data - y).square().mean()
@@ -178,7 +169,7 @@ def update(
         loss = losses.sac_actor_loss(log_prob, losses.reduce_critics(q_pi, "min"), ent_coef)
         return loss, (actions, log_prob, losses.reduce_critics(q_pi, "mean"))
 
-    new["actor"], loss, kept, norm = descend(pi_loss, state["actor"], lr, settings["actor"], max_grad_norm)
+    new["actor"], loss, kept, norm = descend(pi_loss, state["actor"], lr, settings["actor"], clip)
     actions, log_prob, q_pi = kept
     metrics.update(actor_loss=loss, grad_norm_actor=norm, entropy=-log_prob.mean(), ent_coef=ent_coef.mean())
     metrics.update(q_policy=q_pi.mean(), q_gap=q_pi.mean() - q_data.mean())

@@ -13,8 +13,8 @@ from sb3_dce import losses
 from sb3_dce.actors import DeterministicActor
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
-from sb3_dce.checks import check_number, check_optional
-from sb3_dce.execution import Update
+from sb3_dce.checks import check_number
+from sb3_dce.execution import Update, UpdateOptions, bound_update
 from sb3_dce.networks import OfflineCritic
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import OfflineTD3Policy
@@ -37,7 +37,6 @@ class OfflineTD3BC(OfflineAlgorithm):
     :param target_policy_noise: standard deviation of the noise on the target policy's actions, which lie in [-1, 1]
     :param target_noise_clip: largest absolute value of this noise
     :param normalize_obs: standardise observations, on by default as the method says
-    :param max_grad_norm: clip each network's gradient to this norm; ``None`` is off
     """
 
     algo_name: ClassVar[str] = "offline_td3bc"
@@ -89,6 +88,7 @@ class OfflineTD3BC(OfflineAlgorithm):
             tau=tau,
             gamma=gamma,
             gradient_steps=gradient_steps,
+            max_grad_norm=max_grad_norm,
             d4rl_compat=d4rl_compat,
             normalize_obs=normalize_obs,
             reward_normalization=reward_normalization,
@@ -108,7 +108,6 @@ class OfflineTD3BC(OfflineAlgorithm):
         self.policy_update_freq = policy_update_freq
         self.target_policy_noise = target_policy_noise
         self.target_noise_clip = target_noise_clip
-        self.max_grad_norm = max_grad_norm
         if _init_setup_model:
             self._setup_model()
 
@@ -118,7 +117,6 @@ class OfflineTD3BC(OfflineAlgorithm):
         check_number("policy_update_freq", self.policy_update_freq, 1, integer=True)
         check_number("target_policy_noise", self.target_policy_noise, 0)
         check_number("target_noise_clip", self.target_noise_clip, 0)
-        check_optional("max_grad_norm", self.max_grad_norm)
 
     def make_update(self, storages: dict[str, Storage]) -> Update:
         nets = {
@@ -128,13 +126,7 @@ class OfflineTD3BC(OfflineAlgorithm):
             "first_critic": PureNet(self.critic, "q1_forward"),
             "critic_target": PureNet(self.critic_target),
         }
-        settings = {name: s.settings for name, s in storages.items() if s.settings is not None}
-        max_grad_norm = self.max_grad_norm
-
-        def td3_bc_update(state: Any, batch: Any, noise: Any, coef: Any, with_actor: bool) -> Any:
-            return update(max_grad_norm, nets, settings, state, batch, noise, coef, with_actor)
-
-        return td3_bc_update
+        return bound_update(update, UpdateOptions(self.max_grad_norm), nets, storages)
 
     def update_variant(self, n_updates: int) -> dict[str, Any]:
         return {"with_actor": (n_updates + 1) % self.policy_update_freq == 0}
@@ -152,7 +144,7 @@ class OfflineTD3BC(OfflineAlgorithm):
 
 
 def update(
-    max_grad_norm: float | None,
+    options: UpdateOptions,
     nets: dict[str, PureNet],
     settings: dict[str, Any],
     state: dict[str, Any],
@@ -164,7 +156,7 @@ def update(
     """
     One gradient step of TD3+BC: critics; at every ``policy_update_freq``-th step also actor, then all targets.
 
-    :param max_grad_norm: clip each network's gradient to this norm
+    :param options: choices fixed at trace time
     :param nets: networks as functions of their flat parameters; "first_critic" is Q_1 of the parameters of "critic"
     :param settings: optimizer constants of each learner
     :param state: learners "actor", "critic" and flat targets
@@ -176,7 +168,7 @@ def update(
     """
     s, a, s2, d = batch.observations, batch.actions, batch.next_observations, batch.dones
     r = coef["reward_scale"] * batch.rewards + coef["reward_shift"]
-    lr = coef["learning_rate"]
+    lr, clip = coef["learning_rate"], options.max_grad_norm
     new: dict[str, Any] = {}
 
     # 1 target
@@ -194,7 +186,7 @@ def update(
         q_data = nets["critic"](params, s, a)
         return losses.critic_loss(q_data, y, 1.0), th.cat(list(q_data), dim=-1)
 
-    new["critic"], loss, q_data, norm = descend(q_loss, state["critic"], lr, settings["critic"], max_grad_norm)
+    new["critic"], loss, q_data, norm = descend(q_loss, state["critic"], lr, settings["critic"], clip)
     metrics = {"critic_loss": loss, "grad_norm_q": norm, "td_target": y.mean(), "value_next": next_values.mean()}
     metrics.update(q_data_metrics(q_data))
     metrics["td_mse"] = (q_data - y).square().mean()
@@ -207,7 +199,7 @@ def update(
         q_pi = nets["first_critic"](new["critic"].params, s, actions)
         return losses.td3bc_actor_loss(q_pi, actions, a, coef["alpha"]), (actions, q_pi)
 
-    new["actor"], loss, (actions, q_pi), norm = descend(pi_loss, state["actor"], lr, settings["actor"], max_grad_norm)
+    new["actor"], loss, (actions, q_pi), norm = descend(pi_loss, state["actor"], lr, settings["actor"], clip)
     metrics.update(actor_loss=loss, grad_norm_actor=norm, bc_loss=losses.bc_mse(actions, a))
     metrics["lambda"] = losses.td3bc_lambda(q_pi, coef["alpha"])
     metrics.update(q_policy=q_pi.mean(), q_gap=q_pi.mean() - q_data.mean())

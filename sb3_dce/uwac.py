@@ -14,8 +14,8 @@ from sb3_dce import losses
 from sb3_dce.actor_rate import ActorLearningRate
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
-from sb3_dce.checks import check_choice, check_number, check_optional, check_widths
-from sb3_dce.execution import Update
+from sb3_dce.checks import check_choice, check_number, check_widths
+from sb3_dce.execution import Update, UpdateOptions, bound_update
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.state import PureNet, Storage
 from sb3_dce.steps import action_metrics, descend, polyak, q_data_metrics
@@ -31,14 +31,13 @@ KL_WEIGHT = 0.5
 
 
 @dataclass(frozen=True)
-class UWACOptions:
+class UWACOptions(UpdateOptions):
     """Choices of :func:`update` that are fixed when it is traced; see :class:`OfflineUWAC` for their meaning."""
 
     n_critics: int
     n_masks: int  # hidden layers of the critics
     weight_squared: bool
     actor_q_timing: str
-    max_grad_norm: float | None
 
 
 class OfflineUWAC(ActorLearningRate, OfflineAlgorithm):
@@ -78,7 +77,6 @@ class OfflineUWAC(ActorLearningRate, OfflineAlgorithm):
         ``"updated"``
     :param n_predict_actions: actions drawn for a prediction
     :param vae_net_arch: hidden layers of the autoencoder, ``None`` for [750, 750]
-    :param max_grad_norm: clip each network's gradient to this norm; ``None`` is off
     """
 
     algo_name: ClassVar[str] = "offline_uwac"
@@ -141,6 +139,7 @@ class OfflineUWAC(ActorLearningRate, OfflineAlgorithm):
             tau=tau,
             gamma=gamma,
             gradient_steps=gradient_steps,
+            max_grad_norm=max_grad_norm,
             d4rl_compat=d4rl_compat,
             normalize_obs=normalize_obs,
             reward_normalization=reward_normalization,
@@ -170,7 +169,6 @@ class OfflineUWAC(ActorLearningRate, OfflineAlgorithm):
         self.actor_q_timing = actor_q_timing
         self.n_predict_actions = n_predict_actions
         self.vae_net_arch = vae_net_arch
-        self.max_grad_norm = max_grad_norm
         if _init_setup_model:
             self._setup_model()
 
@@ -190,7 +188,6 @@ class OfflineUWAC(ActorLearningRate, OfflineAlgorithm):
         check_choice("actor_q_timing", self.actor_q_timing, ("previous", "updated"))
         if self.vae_net_arch is not None:
             check_widths("vae_net_arch", self.vae_net_arch)
-        check_optional("max_grad_norm", self.max_grad_norm)
 
     def policy_settings(self) -> dict[str, Any]:
         return {
@@ -236,7 +233,6 @@ class OfflineUWAC(ActorLearningRate, OfflineAlgorithm):
             "vae": PureNet(self.vae),
             "vae_sample": PureNet(self.vae, "sample"),
         }
-        settings = {name: s.settings for name, s in storages.items() if s.settings is not None}
         options = UWACOptions(
             n_critics=self.critic.n_critics,
             n_masks=len(self.critic.net_arch),
@@ -244,11 +240,7 @@ class OfflineUWAC(ActorLearningRate, OfflineAlgorithm):
             actor_q_timing=self.actor_q_timing,
             max_grad_norm=self.max_grad_norm,
         )
-
-        def uwac_update(state: Any, batch: Any, noise: Any, coef: Any, mmd_only: bool) -> Any:
-            return update(options, nets, settings, state, batch, noise, coef, mmd_only)
-
-        return uwac_update
+        return bound_update(update, options, nets, storages)
 
     def update_variant(self, n_updates: int) -> dict[str, Any]:
         return {"mmd_only": n_updates < self.policy_eval_start}

@@ -7,7 +7,7 @@ import json
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pandas as pd
@@ -16,8 +16,9 @@ from commands import sb3_dce
 from dataset_files import N_ROWS, base_arrays, write_plain
 
 from sb3_dce import Transitions
-from sb3_dce.data.advice import Check, Examination, Penalty, examine, row_penalty, share_at_bounds, survival
+from sb3_dce.data.advice import _RULES, Check, Examination, Penalty, examine, row_penalty, share_at_bounds, survival
 from sb3_dce.data.catalog import resolve
+from sb3_dce.data.records import CheckName, Finding
 from sb3_dce.errors import ConfigError, DatasetError
 
 Arrays = dict[str, np.ndarray]
@@ -196,9 +197,9 @@ def test_a_finding_of_the_reader_without_a_row_in_the_table_is_shown(transitions
 
     from sb3_dce.data.advice import examine_transitions
 
-    unknown = replace(transitions, info=replace(transitions.info, notes=("something new",)))
-    (check,) = [check for check in examine_transitions(unknown, row_penalty(None)) if check.name == "other"]
-    assert (check.verdict, check.what) == ("note", "something new")
+    unknown = replace(transitions.info, findings=(Finding("other", "warning", "something new", 3),))
+    found = examine_transitions(replace(transitions, info=unknown), row_penalty(None))
+    assert [check for check in found if check.name == "other"] == [Check("other", "warning", "something new", 3)]
 
 
 def test_episodes_beyond_the_time_limit_are_counted(tmp_path: Path) -> None:
@@ -385,3 +386,7 @@ def test_examination_keeps_the_first_error(tmp_path: Path) -> None:
     arrays["rewards"][3] = np.nan
     error = checked(tmp_path, arrays).error
     assert isinstance(error, DatasetError) and error.key == "rewards" and error.count == 1
+
+
+def test_every_check_of_the_reader_has_a_line() -> None:
+    assert {rule.name for rule in _RULES} | {"time limit", "other"} == set(get_args(CheckName))

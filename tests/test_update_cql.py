@@ -290,7 +290,7 @@ def test_multiplier_weighs_the_distance_to_the_threshold() -> None:
     # multiplier 1, w = 3, gap 4: w gap - 5 = 7; the other form is 3 (4 - 5) = -3
     coef = {"cql_weight": th.tensor(3.0), "lagrange_threshold": th.tensor(5.0)}
     for form, expected in (("weighted_gap", 7.0), ("gap", -3.0)):
-        options = CQLOptions(True, form, "previous", None)
+        options = CQLOptions(max_grad_norm=None, lagrange=True, lagrange_form=form, actor_q_timing="previous")
         assert _penalties(options, th.tensor([4.0, 4.0]), th.ones(1), coef).tolist() == [expected, expected]
 
 

@@ -7,7 +7,6 @@ table, so that what is all right is said too, beside a few checks that need the 
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -22,7 +21,7 @@ from sb3_dce.data.catalog import DatasetSpec, spec_of_file
 from sb3_dce.data.layout import row_blocks
 from sb3_dce.data.loading import load_transitions
 from sb3_dce.data.quality import HUGE_REWARD, HUGE_VALUE
-from sb3_dce.data.records import DatasetInfo
+from sb3_dce.data.records import CheckName, DatasetInfo, Finding
 from sb3_dce.data.transitions import Transitions
 from sb3_dce.errors import ConfigError, DatasetError, DatasetSemanticsError, DatasetWarning
 from sb3_dce.schedules import StepSchedule
@@ -30,6 +29,8 @@ from sb3_dce.schedules import StepSchedule
 Verdict = Literal["ok", "note", "warning", "error"]
 VERDICTS: tuple[Verdict, ...] = ("ok", "note", "warning", "error")
 EXIT_CODES: dict[Verdict, int] = {"ok": 0, "note": 0, "warning": 1, "error": 2}
+
+READABLE = "readable"  # name of the check that the data could be read at all
 
 # An entry counts as lying on its bound if it is nearer than this share of half the range: float32 of tanh, and clipping.
 BOUND_TOLERANCE = 1e-3
@@ -203,15 +204,10 @@ def examine_transitions(transitions: Transitions, penalty: Penalty, limit: int |
     :param limit: time limit of the environment, steps, if known
     :return: verdicts
     """
-    findings = [("note", text) for text in transitions.info.notes] + [("warning", t) for t in transitions.info.warnings]
+    findings = transitions.info.findings
+    checks = [Check(READABLE, "ok", _readable_text(transitions))]
+    checks += [_reader_check(rule, [f for f in findings if f.check == rule.name], transitions) for rule in _RULES]
     time_limit = _time_limit(transitions, limit)
-    if time_limit.verdict != "ok":  # it says more than the reader does
-        findings = [finding for finding in findings if "longer than the environment's limit" not in finding[1]]
-    checks: list[Check] = []
-    for rule in _RULES:
-        matching = [finding for finding in findings if re.search(rule.pattern, finding[1])]
-        findings = [finding for finding in findings if finding not in matching]
-        checks.append(_reader_check(rule, matching, transitions))
     checks += [
         _constant_actions(transitions),
         _actions_at_bounds(transitions),
@@ -220,9 +216,9 @@ def examine_transitions(transitions: Transitions, penalty: Penalty, limit: int |
         _returns(transitions),
         survival(transitions.info.reward_mean, transitions.info.n_terminals, penalty),
     ]
-    # A finding of the reader that has no row in the table is shown all the same.
-    checks += [Check("other", verdict, text) for verdict, text in findings]  # type: ignore[arg-type]
-    return checks
+    # The line of the time limit says more than the reader does, unless another limit was asked for.
+    without_a_line = [f for f in findings if f.check == "other" or (f.check == "time limit" and time_limit.verdict == "ok")]
+    return checks + [Check("other", f.level, f.text, f.count) for f in without_a_line]
 
 
 def survival(reward_mean: float, n_terminals: int, penalty: Penalty) -> Check:
@@ -271,37 +267,31 @@ def share_at_bounds(transitions: Transitions) -> np.ndarray:
 
 class _Rule(NamedTuple):
     """
-    Findings of the reader that belong to one check.
+    One check of the reader.
 
     :param name: of the check
-    :param pattern: regular expression of these findings
     :param fine: what to say if there are none
     :param remedy: what to do about them
-    :param locate: how often and where, for findings whose text does not say so
+    :param locate: how often and where, for findings that do not say so
     """
 
-    name: str
-    pattern: str
+    name: CheckName
     fine: Callable[[Transitions], str]
     remedy: str
     locate: Callable[[Transitions], tuple[int, str]] | None = None
 
 
-def _reader_check(rule: _Rule, findings: list[tuple[str, str]], transitions: Transitions) -> Check:
+def _reader_check(rule: _Rule, findings: list[Finding], transitions: Transitions) -> Check:
     if not findings:
         return Check(rule.name, "ok", rule.fine(transitions))
-    verdict = "warning" if any(level == "warning" for level, _ in findings) else "note"
-    what = "; ".join(text for _, text in findings)
-    if rule.locate is not None:
-        count, where = rule.locate(transitions)
-        return Check(rule.name, verdict, what, count, where, rule.remedy)  # type: ignore[arg-type]
-    leading = re.match(r"\d+(?= )", what)
-    return Check(rule.name, verdict, what, int(leading[0]) if leading else None, None, rule.remedy)  # type: ignore[arg-type]
+    worst = max((finding.level for finding in findings), key=VERDICTS.index)
+    what = "; ".join(finding.text for finding in findings)
+    count, where = (findings[0].count, None) if rule.locate is None else rule.locate(transitions)
+    return Check(rule.name, worst, what, count, where, rule.remedy)
 
 
 def _refusal(error: DatasetError) -> Check:
-    names = {"NaN or infinite": "finite values", "action entries": "action bounds", "a shift of": "next observations"}
-    name = next((name for text, name in names.items() if text in error.what), "readable")
+    name = error.check if isinstance(error, DatasetSemanticsError) else READABLE
     where = error.where if error.index is None else f"{error.where}, at {error.index}"
     return Check(name, "error", error.what, error.count, where, error.hint)
 
@@ -458,81 +448,68 @@ def _duplicates_text(transitions: Transitions) -> str:
 
 
 _RULES = (
-    _Rule("readable", r"(?!)", _readable_text, ""),
     _Rule(
         "finite values",
-        r"NaN or infinite",
         lambda data: f"no NaN or infinity in {data.info.rows:,} rows",
         "Find out why they were recorded",
     ),
-    _Rule("action bounds", r"outside of the bounds", _bounds_text, "Give the bounds with action_low and action_high"),
+    _Rule("action bounds", _bounds_text, "Give the bounds with action_low and action_high"),
     _Rule(
         "action scale",
-        r"inner half of their bounds|bounds of the actions by",
         lambda data: "the actions fill more than the inner half of their bounds",
         "Give the true bounds with action_low and action_high, so that they are scaled to [-1, 1]",
     ),
     _Rule(
         "action type",
-        r"actions are stored as",
         lambda data: "floating point numbers",
         "If they are numbers of choices, these agents cannot learn from them",
     ),
     _Rule(
         "reward scale",
-        r"rewards reach",
         lambda data: f"none beyond {HUGE_REWARD:g}",
         "Set reward_scale; sb3-dce datasets report recommends one",
     ),
-    _Rule("observation type", r"are integers", lambda data: "floating point numbers", "Store float32"),
+    _Rule("observation type", lambda data: "floating point numbers", "Store float32"),
     _Rule(
         "constant observations",
-        r"columns are constant",
         lambda data: "every observation column varies",
         "Harmless for training; leave them out if they carry nothing",
     ),
     _Rule(
         "huge observations",
-        r"observations reach",
         lambda data: f"none beyond {HUGE_VALUE:g}",
         "Rescale these columns, or standardise with normalize_obs=True",
         _huge_columns,
     ),
     _Rule(
         "rewards",
-        r"reward is constant",
         lambda data: f"{data.info.reward_min:.4g} to {data.info.reward_max:.4g}, mean {data.info.reward_mean:.4g}",
         "Check which column holds the reward",
         lambda data: (len(data), "key rewards"),
     ),
     _Rule(
         "flags",
-        r"rows? ends? an episode|terminal and timeout at once|no row is marked as the end",
         lambda data: f"{data.info.n_terminals / data.info.file_rows:.2%} of the rows are terminal, none is a timeout as well",
         "terminals are 1 where the task truly ended, timeouts where a time limit did",
     ),
     _Rule(
         "next observations",
-        r"unmarked jumps|not the next row's observation",
         _order_text,
         "Mark the ends of episodes with timeouts, and keep rows in the order of time",
     ),
     _Rule(
         "duplicated rows",
-        r"duplicates of another row",
         _duplicates_text,
         "Were files joined twice? Leave the copies out",
         _duplicates,
     ),
     _Rule(
         "episode ends",
-        r"no timeouts key",
         lambda data: f"{data.info.episodes:,} whole episodes by {data.info.episode_rule}",
         "Store timeouts, or pass max_episode_steps, if episodes are cut in the wrong places",
     ),
     _Rule(
         "last episode",
-        r"last episode is open",
         lambda data: "closed by a flag",
         "Nothing, unless it should have been marked; it is left out of the returns",
     ),

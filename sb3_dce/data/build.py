@@ -131,7 +131,8 @@ def build_rows(
     bad = check_finite(summaries.values(), rows, used, options.drop_nonfinite, where)
     if bad is not None:
         used &= ~bad
-        findings.notes.append(f"{int(bad.sum())} rows with NaN or infinite values were dropped")
+        n_bad = int(bad.sum())
+        findings.note("finite values", f"{n_bad} rows with NaN or infinite values were dropped", n_bad)
         _require_rows(used, where)
     _check_content(rows, layout, summaries, sources, findings)
     actions = check_actions(rows[:, layout.actions], summaries["actions"], options, findings, where)
@@ -169,8 +170,7 @@ def build_rows(
         action_high=actions.highest,
         action_space_low=actions.low,
         action_space_high=actions.high,
-        notes=tuple(findings.notes),
-        warnings=tuple(findings.warnings),
+        findings=tuple(findings.found),
     )
     return BuiltRows(rows, layout, timeouts, index, info)
 
@@ -232,15 +232,16 @@ def _check_content(
 ) -> None:
     check_observations(summaries["observations"], sources["observations"].dtype.kind in "iu", findings)
     if (kind := sources["actions"].dtype).kind in "iub":
-        findings.warnings.append(
-            f"actions are stored as {kind}: numbers of discrete actions? The agents act continuously, there is none for those"
+        findings.warning(
+            "action type",
+            f"actions are stored as {kind}: numbers of discrete actions? The agents act continuously, there is none for those",
         )
     reward = summaries["rewards"]
     largest = max(abs(reward.low[0]), abs(reward.high[0]))
     if largest > HUGE_REWARD:
-        findings.warnings.append(f"rewards reach {largest:.3g}: critics learn such values slowly, set reward_scale")
+        findings.warning("reward scale", f"rewards reach {largest:.3g}: critics learn such values slowly, set reward_scale")
     if reward.low[0] == reward.high[0]:
-        findings.warnings.append(f"the reward is constant, {reward.low[0]:g}: there is nothing to learn from")
+        findings.warning("rewards", f"the reward is constant, {reward.low[0]:g}: there is nothing to learn from")
 
 
 def _whole_episodes(episodes: Episodes, returns: np.ndarray, bad: np.ndarray | None) -> np.ndarray:

@@ -19,6 +19,7 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from sb3_dce.data.file_checks import translated_errors
+from sb3_dce.data.records import Finding
 from sb3_dce.errors import ConfigError, DatasetError, DatasetFormatError, DatasetIntegrityError, DatasetNotFoundError
 from sb3_dce.files import expanded
 
@@ -219,17 +220,18 @@ def environment_spec(dataset: MinariDataset) -> dict[str, Any]:
     return {}
 
 
-def reward_note(name: str) -> list[str]:
+def reward_findings(name: str) -> list[Finding]:
     """
     :param name: ``minari:`` and the id
     :return: a note for data whose rewards deserve a look
     """
     if not _DOUBTFUL_REWARDS.match(name.removeprefix(PREFIX)):
         return []
-    return [
+    text = (
         "rewards of this replay may pay for the distance to the object instead of charging it (Gymnasium-Robotics pull "
         "request 220): compare an episode; scores of D4RL do not apply"
-    ]
+    )
+    return [Finding("other", "note", text)]
 
 
 def label(leaf: Leaf) -> str:

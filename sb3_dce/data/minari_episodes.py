@@ -19,6 +19,7 @@ from sb3_dce.data.file_checks import translated_errors
 from sb3_dce.data.hdf5 import EpisodeFile
 from sb3_dce.data.layout import ArraySource, read_flags
 from sb3_dce.data.minari import ARROW_FORMATS, Flatten, Leaf, MinariDataset, label, observation_leaves
+from sb3_dce.data.records import Finding
 from sb3_dce.errors import ConfigError, DatasetFormatError, DatasetSecurityError
 
 _KEYS = ("actions", "rewards", "terminations", "truncations")
@@ -76,14 +77,14 @@ class Stacked:
 @contextmanager
 def open_episodes(
     dataset: MinariDataset, flatten: Flatten, max_bytes: int
-) -> Iterator[tuple[dict[str, ArraySource], list[str]]]:
+) -> Iterator[tuple[dict[str, ArraySource], list[Finding]]]:
     """
     The arrays of a dataset, with the keys of D4RL's layout, while its file is open.
 
     :param dataset: the dataset
     :param flatten: see :func:`~sb3_dce.data.minari.observation_leaves`
     :param max_bytes: largest size of the arrays that are read
-    :return: key to array, and notes
+    :return: key to array, and what was found on the way
     :raises ConfigError: if ``flatten`` does not fit, or a package for this format is missing
     :raises DatasetError: if episodes are missing or broken, or the observation is no vector
     """
@@ -104,7 +105,7 @@ def open_episodes(
 
 def _sources(
     dataset: MinariDataset, leaves: Sequence[Leaf], episodes: Sequence[Episode]
-) -> tuple[dict[str, ArraySource], list[str]]:
+) -> tuple[dict[str, ArraySource], list[Finding]]:
     where = str(dataset.file)
     lengths = _lengths(episodes, leaves, where)
     starts = np.concatenate(([0], np.cumsum(lengths)))
@@ -112,7 +113,7 @@ def _sources(
     stacked = {key: Stacked([[episode.others[key]] for episode in episodes], starts) for key in _KEYS}
     terminals = read_flags(stacked["terminations"], "terminations", where)
     truncations = read_flags(stacked["truncations"], "truncations", where)
-    timeouts, notes = _timeouts(terminals, truncations, starts[1:] - 1)
+    timeouts, findings = _timeouts(terminals, truncations, starts[1:] - 1)
     sources: dict[str, ArraySource] = {
         "observations": Stacked(observations, starts),
         "actions": stacked["actions"],
@@ -124,33 +125,37 @@ def _sources(
     if leaves != [()]:
         widths = [Stacked([[array]], starts[:2]).shape for array in observations[0]]
         parts = (f"{label(leaf)} ({shape[1] if len(shape) == 2 else 1})" for leaf, shape in zip(leaves, widths, strict=True))
-        notes.insert(0, f"the observation is {' | '.join(parts)}")
+        findings.insert(0, Finding("other", "note", f"the observation is {' | '.join(parts)}"))
     promised = dataset.metadata.get("total_steps")
     if isinstance(promised, int) and promised != starts[-1]:
-        notes.append(f"metadata.json says {promised:,} steps, there are {starts[-1]:,}")
-    return sources, notes
+        findings.append(Finding("other", "note", f"metadata.json says {promised:,} steps, there are {starts[-1]:,}"))
+    return sources, findings
 
 
-def _timeouts(terminals: np.ndarray, truncations: np.ndarray, last_rows: np.ndarray) -> tuple[np.ndarray, list[str]]:
+def _timeouts(terminals: np.ndarray, truncations: np.ndarray, last_rows: np.ndarray) -> tuple[np.ndarray, list[Finding]]:
     """
     Where episodes end without a terminal: at truncations, and at the end of each group but the last one, which may be open.
 
     :param terminals: shape (rows,), bool
     :param truncations: shape (rows,), bool
     :param last_rows: last row of each episode
-    :return: timeouts, shape (rows,), bool, and notes
+    :return: timeouts, shape (rows,), bool, and what was found
     """
-    timeouts, notes = truncations & ~terminals, []
+    timeouts = truncations & ~terminals
+    findings: list[Finding] = []
     if n_both := int((truncations & terminals).sum()):
-        notes.append(f"{n_both} steps terminate and are truncated at once: the terminal wins")
+        text = f"{n_both} steps terminate and are truncated at once: the terminal wins"
+        findings.append(Finding("flags", "note", text, n_both))
     ended = terminals | truncations
     unmarked = last_rows[:-1][~ended[last_rows[:-1]]]
     if len(unmarked):
         timeouts[unmarked] = True
-        notes.append(f"{len(unmarked)} episodes end without a flag: taken for time limits")
+        text = f"{len(unmarked)} episodes end without a flag: taken for time limits"
+        findings.append(Finding("episode ends", "note", text, len(unmarked)))
     if n_inside := int(ended.sum() - ended[last_rows].sum()):
-        notes.append(f"{n_inside} steps within an episode of Minari carry a flag: an episode ends there")
-    return timeouts, notes
+        text = f"{n_inside} steps within an episode of Minari carry a flag: an episode ends there"
+        findings.append(Finding("episode ends", "note", text, n_inside))
+    return timeouts, findings
 
 
 def _lengths(episodes: Sequence[Episode], leaves: Sequence[Leaf], where: str) -> np.ndarray:

@@ -15,7 +15,7 @@ from sb3_dce.data.columns import ColumnSummary
 from sb3_dce.data.episodes import MAX_JUMP_SHARE, Episodes, find_jumps, find_shift
 from sb3_dce.data.hashes import row_hashes
 from sb3_dce.data.layout import WIDE_BLOCK_ROWS, RowLayout, row_blocks
-from sb3_dce.data.records import ReadOptions
+from sb3_dce.data.records import CheckName, Finding, ReadOptions
 from sb3_dce.errors import DatasetSemanticsError
 
 # Beyond these a loss becomes NaN, a scale is probably wrong, or data were probably joined twice.
@@ -28,14 +28,28 @@ MAX_DUPLICATES = 0.05
 @dataclass
 class Findings:
     """
-    What the checks found, in the order of the checks.
+    What the checks found.
 
-    :param notes: worth knowing
-    :param warnings: deserve a look
+    :param found: in the order of the checks
     """
 
-    notes: list[str] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
+    found: list[Finding] = field(default_factory=list)
+
+    def note(self, check: CheckName, text: str, count: int | None = None) -> None:
+        """
+        :param check: name of the check
+        :param text: what is worth knowing
+        :param count: how many entries, rows or episodes it concerns
+        """
+        self.found.append(Finding(check, "note", text, count))
+
+    def warning(self, check: CheckName, text: str, count: int | None = None) -> None:
+        """
+        :param check: name of the check
+        :param text: what deserves a look
+        :param count: how many entries, rows or episodes it concerns
+        """
+        self.found.append(Finding(check, "warning", text, count))
 
 
 class ActionRange(NamedTuple):
@@ -79,6 +93,7 @@ def check_finite(
         counts = (f"{s.key} has {s.n_bad} NaN or infinite values, the first at (row, column) {s.first_bad}" for s in dirty)
         raise DatasetSemanticsError(
             "; ".join(counts),
+            check="finite values",
             where=where,
             hint=f"Repair the file, or drop_nonfinite=True removes {int(bad.sum())} rows",
             key=dirty[0].key,
@@ -106,7 +121,7 @@ def check_actions(
     low, high = options.action_bounds(actions.shape[1], lowest, highest)
     if options.action_scale is not None:
         shown = ", ".join(f"{a:g}..{b:g}" for a, b in zip(low, high, strict=True))
-        findings.notes.append(f"bounds of the actions by action_scale={options.action_scale!r}: {shown}")
+        findings.note("action scale", f"bounds of the actions by action_scale={options.action_scale!r}: {shown}")
     half_range = (high - low) / 2
     excess = np.maximum(low - lowest, highest - high)
     if excess.max() > 0:
@@ -118,6 +133,7 @@ def check_actions(
             found = ", ".join(f"{a:g}..{b:g}" for a, b in zip(lowest, highest, strict=True))
             raise DatasetSemanticsError(
                 f"{n_outside} action entries are outside of [{low.min():g}, {high.max():g}]; range per dimension: {found}",
+                check="action bounds",
                 where=f"{where}, key actions",
                 hint="Give the bounds of the action space as action_low= and action_high=, or take those of the data with "
                 "action_scale='data'; clip_actions=True moves the entries onto the bounds",
@@ -126,9 +142,10 @@ def check_actions(
             )
         for block in row_blocks(len(actions)):
             np.clip(actions[block], low, high, out=actions[block])
-        findings.warnings.append(f"{n_outside} action entries were outside of the bounds by up to {excess.max():.2g}: clipped")
+        text = f"{n_outside} action entries were outside of the bounds by up to {excess.max():.2g}: clipped"
+        findings.warning("action bounds", text, n_outside)
     elif options.action_scale != "data" and _within_half(lowest, highest, low, half_range):
-        findings.notes.append("all actions lie within the inner half of their bounds: is the scale right?")
+        findings.note("action scale", "all actions lie within the inner half of their bounds: is the scale right?")
     return ActionRange(np.clip(lowest, low, high), np.clip(highest, low, high), low, high)
 
 
@@ -141,13 +158,15 @@ def check_observations(summary: ColumnSummary, is_integer: bool, findings: Findi
     :param findings: notes and warnings
     """
     if is_integer:
-        findings.warnings.append("observations are integers: cast to float32")
+        findings.warning("observation type", "observations are integers: cast to float32")
     constant = np.flatnonzero(summary.low == summary.high)
     if len(constant):
         shown = ", ".join(map(str, constant[:10])) + (", ..." if len(constant) > 10 else "")
-        findings.notes.append(f"{len(constant)} observation columns are constant: {shown}")
+        text = f"{len(constant)} observation columns are constant: {shown}"
+        findings.note("constant observations", text, len(constant))
     if summary.largest > HUGE_VALUE:
-        findings.warnings.append(f"observations reach {summary.largest:.3g}: such values make the loss NaN, rescale them")
+        text = f"observations reach {summary.largest:.3g}: such values make the loss NaN, rescale them"
+        findings.warning("huge observations", text)
 
 
 def check_flags(terminals: np.ndarray, timeouts: np.ndarray | None, findings: Findings) -> None:
@@ -160,12 +179,12 @@ def check_flags(terminals: np.ndarray, timeouts: np.ndarray | None, findings: Fi
     """
     share = float(terminals.mean())
     if share == 1.0:
-        findings.warnings.append("each row ends an episode; V(s') is never used")
+        findings.warning("flags", "each row ends an episode; V(s') is never used")
     elif share > 0.5:
-        findings.warnings.append(f"{share:.0%} of the rows end an episode: do the flags mean 'not done'?")
+        findings.warning("flags", f"{share:.0%} of the rows end an episode: do the flags mean 'not done'?")
     n_both = 0 if timeouts is None else int((terminals & timeouts).sum())
     if n_both:
-        findings.warnings.append(f"{n_both} rows are terminal and timeout at once: the terminal wins")
+        findings.warning("flags", f"{n_both} rows are terminal and timeout at once: the terminal wins", n_both)
 
 
 def check_order(
@@ -195,21 +214,24 @@ def check_order(
         return jumps
     share = n_jumps / n_inner
     if share < MAX_JUMP_SHARE:
-        findings.notes.append(f"{n_jumps} unmarked jumps of the observation ({share:.2%} of rows): an episode ends there")
+        text = f"{n_jumps} unmarked jumps of the observation ({share:.2%} of rows): an episode ends there"
+        findings.note("next observations", text, n_jumps)
         return jumps
     shift = find_shift(rows, layout, inner)
     if shift is not None:
         raise DatasetSemanticsError(
             f"{share:.0%} of the next observations are not the next row's observation; next_observations[i] is "
             f"observations[i + {1 + shift}], a shift of {shift:+d} rows",
+            check="next observations",
             where=f"{where}, key next_observations",
             hint="Shift the array back, or leave it out",
             key="next_observations",
             count=n_jumps,
         )
-    findings.warnings.append(
+    findings.warning(
+        "next observations",
         f"{share:.0%} of the next observations are not the next row's observation: if the rows are shuffled, returns and "
-        "lengths of episodes mean nothing"
+        "lengths of episodes mean nothing",
     )
     return jumps if timeouts is None else None
 
@@ -228,7 +250,7 @@ def check_duplicates(rows: np.ndarray, findings: Findings) -> None:
     # of n different rows, n / 2**33 share their 32 bits with another one by chance
     share = float((hashes[1:] == hashes[:-1]).sum()) / len(rows) - len(rows) / 2**33
     if share > MAX_DUPLICATES:
-        findings.warnings.append(f"{share:.0%} of the rows are duplicates of another row")
+        findings.warning("duplicated rows", f"{share:.0%} of the rows are duplicates of another row")
 
 
 def check_episodes(episodes: Episodes, n_dropped: int, has_timeouts: bool, limit: int | None, findings: Findings) -> None:
@@ -243,17 +265,19 @@ def check_episodes(episodes: Episodes, n_dropped: int, has_timeouts: bool, limit
     """
     n_episodes = len(episodes.starts) - episodes.open_last
     if not has_timeouts:
-        findings.notes.append(f"no timeouts key; episode ends: {episodes.rule}; {n_episodes} episodes")
+        findings.note("episode ends", f"no timeouts key; episode ends: {episodes.rule}; {n_episodes} episodes")
     if not has_timeouts and limit is None and len(episodes.starts) == 1 and episodes.open_last:
-        findings.warnings.append(
+        findings.warning(
+            "flags",
             f"no row is marked as the end of an episode, so all {len(episodes.ends):,} rows count as one: give timeouts, or "
-            "episodes with an id per row"
+            "episodes with an id per row",
         )
     if episodes.open_last:
-        findings.notes.append(f"the last episode is open: {n_dropped} rows dropped")
+        findings.note("last episode", f"the last episode is open: {n_dropped} rows dropped")
     longest = int(episodes.lengths.max())
     if limit is not None and longest > limit:
-        findings.notes.append(f"episodes of up to {longest} rows are longer than the environment's limit of {limit} steps")
+        text = f"episodes of up to {longest} rows are longer than the environment's limit of {limit} steps"
+        findings.note("time limit", text)
 
 
 def _within_half(lowest: np.ndarray, highest: np.ndarray, low: np.ndarray, half_range: np.ndarray) -> bool:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -157,6 +157,44 @@ class ReadOptions:
         return low, high
 
 
+# Checks of a reader by name; ``other`` is what has no line of its own in ``sb3-dce datasets check``.
+CheckName = Literal[
+    "finite values",
+    "action bounds",
+    "action scale",
+    "action type",
+    "reward scale",
+    "observation type",
+    "constant observations",
+    "huge observations",
+    "rewards",
+    "flags",
+    "next observations",
+    "duplicated rows",
+    "episode ends",
+    "last episode",
+    "time limit",
+    "other",
+]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """
+    What a check of a reader has to say about a dataset that it lets pass.
+
+    :param check: name of the check
+    :param level: ``note`` (worth knowing) or ``warning`` (deserves a look, and is issued as a ``DatasetWarning``)
+    :param text: what was found
+    :param count: how many entries, rows or episodes it concerns, if that was counted
+    """
+
+    check: CheckName
+    level: Literal["note", "warning"]
+    text: str
+    count: int | None = None
+
+
 # Arguments of the readers that are none of an agent.
 READER_OPTIONS = frozenset({f.name for f in fields(ReadOptions)} | {"columns", "sep", "flatten", "trust", "sha256"})
 
@@ -189,8 +227,7 @@ class DatasetInfo:
     :param action_high: largest action found, shape (act_dim,)
     :param action_space_low: bounds of the actions, -1 unless the reader was told otherwise, shape (act_dim,)
     :param action_space_high: bounds of the actions, shape (act_dim,)
-    :param notes: things worth knowing
-    :param warnings: things that deserve a look, each also issued as a ``DatasetWarning``
+    :param findings: what is worth knowing or deserves a look, in the order of the checks
     """
 
     id: str
@@ -215,8 +252,7 @@ class DatasetInfo:
     action_high: np.ndarray
     action_space_low: np.ndarray
     action_space_high: np.ndarray
-    notes: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
     _file_state: tuple[int, int] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -238,6 +274,20 @@ class DatasetInfo:
                 "the file has changed since it was read", where=str(self.path), hint="Read it again", path=self.path
             )
         return file_sha256(self.path)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """
+        :return: things worth knowing
+        """
+        return tuple(finding.text for finding in self.findings if finding.level == "note")
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """
+        :return: things that deserve a look, each also issued as a ``DatasetWarning``
+        """
+        return tuple(finding.text for finding in self.findings if finding.level == "warning")
 
     @property
     def return_range(self) -> float:

@@ -29,7 +29,7 @@ from sb3_dce.data.catalog import DatasetSpec
 from sb3_dce.data.hashes import file_sha256
 from sb3_dce.data.layout import RowLayout
 from sb3_dce.data.locate import cache_folder, embedded_folder
-from sb3_dce.data.records import DatasetInfo, ReadOptions, file_state
+from sb3_dce.data.records import DatasetInfo, Finding, ReadOptions, file_state
 from sb3_dce.errors import CheckpointError, ConfigError, DatasetWarning
 from sb3_dce.files import write_atomically
 
@@ -134,7 +134,7 @@ def _store(built: BuiltRows, entry: Path, key: Mapping[str, Any]) -> None:
         if isinstance(value, np.ndarray):
             arrays[f"info_{name}"] = value
         else:
-            scalars[name] = value
+            scalars[name] = [asdict(finding) for finding in value] if name == "findings" else value
     text = json.dumps(
         {
             "key": key,
@@ -176,7 +176,7 @@ def _load(entry: Path, key: Mapping[str, Any], path: Path) -> BuiltRows | None:
         if not (kinds and shapes and rows.flags.c_contiguous and zlib.crc32(rows.data) == known["crc32"]):
             raise ValueError("its rows are not those that were written")
         values = {**known["info"], **{name.removeprefix("info_"): arrays[name] for name in arrays if name.startswith("info_")}}
-        values |= {name: tuple(values[name]) for name in ("notes", "warnings")}
+        values["findings"] = tuple(Finding(**finding) for finding in values["findings"])
         if values.keys() != set(_info_names()):
             raise ValueError("facts are missing")
         return BuiltRows(rows, layout, timeouts, episodes, DatasetInfo(id=key["id"], path=path, **values))

@@ -17,7 +17,7 @@ from sb3_dce.data.hash_record import verify_hash
 from sb3_dce.data.hashes import content_hash, file_sha256
 from sb3_dce.data.hdf5 import D4RLFile, write_hdf5
 from sb3_dce.data.layout import CORE_KEYS, EPISODES, INCOMPLETE, ArraySource, RowLayout, wanted_keys
-from sb3_dce.data.minari import METADATA_FILE, Flatten, action_bounds, find_minari, reward_note
+from sb3_dce.data.minari import METADATA_FILE, Flatten, action_bounds, find_minari, reward_findings
 from sb3_dce.data.minari_episodes import open_episodes
 from sb3_dce.data.npz import arrays_from_npz, npz_keys, text_from_npz, write_npz
 from sb3_dce.data.records import BOUNDS_ATTRIBUTE, DatasetInfo, ReadOptions, bounds_attribute
@@ -273,11 +273,11 @@ class Transitions:
         read_options = ReadOptions.of(options)
 
         def read() -> BuiltRows:
-            with open_episodes(dataset, flatten, read_options.max_bytes) as (sources, notes):
+            with open_episodes(dataset, flatten, read_options.max_bytes) as (sources, found):
                 built = build_rows(
                     sources, dataset_id=dataset.name, path=dataset.file, found_keys=sources, spec=None, options=read_options
                 )
-            info = replace(built.info, notes=(*notes, *reward_note(dataset.name), *built.info.notes))
+            info = replace(built.info, findings=(*found, *reward_findings(dataset.name), *built.info.findings))
             return built._replace(info=info)
 
         if dataset.data_format != "hdf5":  # many files: the hash of none of them would notice a change of the others
