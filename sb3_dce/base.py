@@ -168,6 +168,9 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
     # Networks of the policy by attribute name. Each becomes an attribute of the agent and a storage of the update; those
     # with an ``optimizer`` are trained, the others are targets or frozen.
     networks: ClassVar[tuple[str, ...]]
+    # Numbers learned beside the networks: attribute of the tensor, ``None`` where the parameters say so, and attribute of its
+    # optimizer. Each becomes a storage of the update and a part of the saved model.
+    learned_numbers: ClassVar[dict[str, str]] = {}
     # Length of the run that these updates belong to, where it is known: what is resumed is executed as it was begun.
     planned_updates: int | None = None
     # Parameters of the subclass in which the members of a population may differ, since they reach the update as numbers.
@@ -295,6 +298,23 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         if not hasattr(self, "rng_state"):
             self._seed_generator(self.seed)
 
+    def start_number(self, name: str, value: th.Tensor | None, learning_rate: float) -> None:
+        """
+        Create one of :attr:`learned_numbers` and its optimizer.
+
+        :param name: attribute of the tensor
+        :param value: its first value, shape (1,); ``None`` if it is not learned
+        :param learning_rate: of the optimizer
+        """
+        number = None if value is None else value.to(self.device).requires_grad_(True)
+        optimizer = None if number is None else th.optim.Adam([number], lr=learning_rate)
+        setattr(self, name, number)
+        setattr(self, self.learned_numbers[name], optimizer)
+
+    def _numbers(self) -> dict[str, str]:
+        """Those of :attr:`learned_numbers` that are learned."""
+        return {name: optimizer for name, optimizer in self.learned_numbers.items() if getattr(self, name, None) is not None}
+
     def set_random_seed(self, seed: int | None = None) -> None:
         seed = check_seed(seed)
         super().set_random_seed(seed)
@@ -328,15 +348,18 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         :return: storage of each network, and of further learners, by name
         """
         modules = {name: getattr(self, name) for name in self.networks}
-        return {name: Storage.of(module) for name, module in modules.items() if module is not None}
+        storages = {name: Storage.of(module) for name, module in modules.items() if module is not None}
+        numbers = {name: Storage([getattr(self, name)], getattr(self, opt)) for name, opt in self._numbers().items()}
+        return {**storages, **numbers}
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), *self.networks]
+        return [*super()._excluded_save_params(), *self.networks, *self.learned_numbers, *self.learned_numbers.values()]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         modules, tensors = super()._get_torch_save_params()
         trained = [name for name in self.networks if hasattr(getattr(self, name), "optimizer")]
-        return modules + [f"{name}.optimizer" for name in trained], tensors
+        numbers = self._numbers()
+        return [*modules, *(f"{name}.optimizer" for name in trained), *numbers.values()], [*tensors, *numbers]
 
     # -- training --------------------------------------------------------------------------------------------------
 

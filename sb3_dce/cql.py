@@ -72,6 +72,7 @@ class OfflineCQL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
 
     algo_name: ClassVar[str] = "offline_cql"
     networks = ("actor", "critic", "critic_target")
+    learned_numbers: ClassVar[dict[str, str]] = {**EntropyCoefficient.learned_numbers, LAGRANGE: "lagrange_optimizer"}
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": OfflineSACPolicy}
     population_scalars = frozenset({"cql_weight", "lagrange_threshold"})
     policy: OfflineSACPolicy
@@ -172,25 +173,7 @@ class OfflineCQL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
     def setup_extras(self) -> None:
         """Create temperature, multiplier and their optimizers."""
         super().setup_extras()
-        self.log_lagrange = self.lagrange_optimizer = None
-        if self.lagrange_threshold is not None:
-            self.log_lagrange = th.zeros(1, device=self.device).requires_grad_(True)
-            self.lagrange_optimizer = th.optim.Adam([self.log_lagrange], lr=self.lr_schedule(1))
-
-    def make_storages(self) -> dict[str, Storage]:
-        storages = super().make_storages()
-        if self.log_lagrange is not None:
-            storages[LAGRANGE] = Storage([self.log_lagrange], self.lagrange_optimizer)
-        return storages
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        modules, tensors = super()._get_torch_save_params()
-        if self.lagrange_threshold is not None:
-            modules, tensors = [*modules, "lagrange_optimizer"], [*tensors, LAGRANGE]
-        return modules, tensors
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), LAGRANGE, "lagrange_optimizer"]
+        self.start_number(LAGRANGE, None if self.lagrange_threshold is None else th.zeros(1), self.lr_schedule(1))
 
     # -- what the base class needs ---------------------------------------------------------------------------------
 

@@ -11,7 +11,6 @@ import torch as th
 from sb3_dce import losses
 from sb3_dce.errors import ConfigError
 from sb3_dce.optimizers import AdamSettings, Learner
-from sb3_dce.state import Storage
 from sb3_dce.steps import descend
 
 ENT_COEF = "log_ent_coef"  # name of the learner in the state tree
@@ -42,6 +41,7 @@ class EntropyCoefficient:
     """Mixin of agents with the parameters ``ent_coef`` and ``target_entropy``; the names are those of SB3's SAC."""
 
     population_scalars: ClassVar[frozenset[str]] = frozenset({"ent_coef", "target_entropy"})
+    learned_numbers: ClassVar[dict[str, str]] = {ENT_COEF: "ent_coef_optimizer"}
     ent_coef: str | float
     target_entropy: str | float
     log_ent_coef: th.Tensor | None
@@ -69,20 +69,8 @@ class EntropyCoefficient:
         """Create the temperature and its optimizer."""
         super().setup_extras()  # type: ignore[misc]
         learned, value = parse_ent_coef(self.ent_coef)
-        device = self.device  # type: ignore[attr-defined]
-        self.log_ent_coef = self.ent_coef_optimizer = None
-        if learned:
-            self.log_ent_coef = th.log(th.full((1,), value, device=device)).requires_grad_(True)
-            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.lr_schedule(1))  # type: ignore[attr-defined]
-
-    def make_storages(self) -> dict[str, Storage]:
-        """
-        :return: storages of the networks and, if it is learned, of the temperature
-        """
-        storages = super().make_storages()  # type: ignore[misc]
-        if self.log_ent_coef is not None:
-            storages[ENT_COEF] = Storage([self.log_ent_coef], self.ent_coef_optimizer)
-        return storages
+        start = th.log(th.full((1,), value)) if learned else None
+        self.start_number(ENT_COEF, start, self.lr_schedule(1))  # type: ignore[attr-defined]
 
     def coefficients(self, n_updates: int) -> dict[str, float]:
         """
@@ -97,16 +85,6 @@ class EntropyCoefficient:
         if target == "auto":
             target = -float(np.prod(self.action_space.shape))  # type: ignore[attr-defined]
         return {**coefficients, "target_entropy": float(target)}
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        modules, tensors = super()._get_torch_save_params()  # type: ignore[misc]
-        if parse_ent_coef(self.ent_coef)[0]:
-            modules, tensors = [*modules, "ent_coef_optimizer"], [*tensors, "log_ent_coef"]
-        return modules, tensors
-
-    def _excluded_save_params(self) -> list[str]:
-        names: list[Any] = super()._excluded_save_params()  # type: ignore[misc]
-        return [*names, "log_ent_coef", "ent_coef_optimizer"]
 
 
 def descend_ent_coef(

@@ -81,6 +81,7 @@ class OfflineUWAC(ActorLearningRate, OfflineAlgorithm):
 
     algo_name: ClassVar[str] = "offline_uwac"
     networks = ("actor", "critic", "critic_target", "vae")
+    learned_numbers: ClassVar[dict[str, str]] = {LOG_ALPHA: "alpha_optimizer"}
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": UWACPolicy}
     population_scalars = frozenset({"alpha_learning_rate", "uwac_beta", "mmd_sigma", "mmd_threshold"})
     policy: UWACPolicy
@@ -202,23 +203,14 @@ class OfflineUWAC(ActorLearningRate, OfflineAlgorithm):
     def setup_extras(self) -> None:
         """Create the multiplier of the MMD constraint and its optimizer."""
         super().setup_extras()
-        self.log_alpha = th.zeros(1, device=self.device).requires_grad_(True)
-        self.alpha_optimizer = th.optim.Adam([self.log_alpha], lr=self.alpha_learning_rate)
+        self.start_number(LOG_ALPHA, th.zeros(1), self.alpha_learning_rate)
 
     def make_storages(self) -> dict[str, Storage]:
         return {
             **super().make_storages(),
-            LOG_ALPHA: Storage([self.log_alpha], self.alpha_optimizer),
             VECTORS: Storage(self.critic.power_vectors()),
             TARGET_VECTORS: Storage(self.critic_target.power_vectors()),
         }
-
-    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        modules, tensors = super()._get_torch_save_params()
-        return [*modules, "alpha_optimizer"], [*tensors, LOG_ALPHA]
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), LOG_ALPHA, "alpha_optimizer"]
 
     # -- what the base class needs ---------------------------------------------------------------------------------
 
