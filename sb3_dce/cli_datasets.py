@@ -15,7 +15,7 @@ from rich.text import Text
 from sb3_dce import cli_recording
 
 if TYPE_CHECKING:
-    from sb3_dce.data.advice import Check
+    from sb3_dce.data.examination import Check
     from sb3_dce.data.transitions import Transitions
 
 app = typer.Typer(help="What data there are, and what is in them.", no_args_is_help=True)
@@ -139,7 +139,7 @@ def check_dataset(
     """
     import json
 
-    from sb3_dce.data.advice import EXIT_CODES, examine
+    from sb3_dce.data.examination import EXIT_CODES, examine
 
     examination = examine(
         dataset,

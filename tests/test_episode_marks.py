@@ -16,7 +16,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_dce import OfflineBC, OfflineDCE, load_dataset
-from sb3_dce.data.advice import examine
+from sb3_dce.data.examination import examine
 from sb3_dce.data.selection import rows_of_best_episodes
 from sb3_dce.envs import SpacesEnv
 from sb3_dce.errors import DatasetError, DatasetFormatError, DatasetSemanticsError, DatasetWarning, SB3DCEError

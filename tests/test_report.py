@@ -17,12 +17,12 @@ from commands import sb3_dce
 from dataset_files import base_arrays, write_plain
 
 from sb3_dce import Transitions
-from sb3_dce.data.advice import Penalty, examine
+from sb3_dce.data.examination import Penalty, examine
 from sb3_dce.errors import ConfigError, DatasetError, DatasetWarning
 from sb3_dce.report import Behaviour, advise, estimate_behaviour, write_report
+from sb3_dce.report.advice import observation_scales
 from sb3_dce.report.behaviour import _smallest
 from sb3_dce.report.page import MARKER
-from sb3_dce.report.verdict import observation_scales
 
 PENALTY = Penalty(beta=4.0, td_loss_coef=1.0, source="a test")
 LENGTH = 50

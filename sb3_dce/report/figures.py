@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sb3_dce.data.advice import share_at_bounds
+from sb3_dce.data.examination import share_at_bounds
 from sb3_dce.data.layout import row_blocks
 from sb3_dce.data.transitions import Transitions
 from sb3_dce.errors import ConfigError

@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import sb3_dce
-from sb3_dce.data.advice import VERDICTS, Check, Examination, examine, file_hash
 from sb3_dce.data.catalog import normalized_score
+from sb3_dce.data.examination import VERDICTS, Check, Examination, examine, file_hash
 from sb3_dce.data.hdf5 import D4RLFile
 from sb3_dce.data.transitions import Transitions
 from sb3_dce.errors import ConfigError, DatasetError
 from sb3_dce.files import write_text
+from sb3_dce.report.advice import Advice, advise
 from sb3_dce.report.behaviour import Behaviour, estimate_behaviour
 from sb3_dce.report.figures import Plot, draw_all
-from sb3_dce.report.verdict import Advice, advise
 
 # By this line a file is known for a report, which may be replaced without asking.
 MARKER = '<meta name="generator" content="sb3-dce datasets report">'

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_dce.data.advice import MAX_AT_BOUNDS, NARROW_MARGIN, Penalty, share_at_bounds
+from sb3_dce.data.examination import MAX_AT_BOUNDS, NARROW_MARGIN, Penalty, share_at_bounds
 from sb3_dce.data.layout import row_blocks
 from sb3_dce.data.transitions import Transitions
 from sb3_dce.report.behaviour import Behaviour

@@ -16,8 +16,8 @@ from commands import sb3_dce
 from dataset_files import N_ROWS, base_arrays, write_plain
 
 from sb3_dce import Transitions
-from sb3_dce.data.advice import _RULES, Check, Examination, Penalty, examine, row_penalty, share_at_bounds, survival
 from sb3_dce.data.catalog import resolve
+from sb3_dce.data.examination import _RULES, Check, Examination, Penalty, examine, row_penalty, share_at_bounds, survival
 from sb3_dce.data.records import CheckName, Finding
 from sb3_dce.errors import ConfigError, DatasetError
 
@@ -195,7 +195,7 @@ def test_the_other_checks_go_on_after_a_refusal(tmp_path: Path) -> None:
 def test_a_finding_of_the_reader_without_a_row_in_the_table_is_shown(transitions: Transitions) -> None:
     from dataclasses import replace
 
-    from sb3_dce.data.advice import examine_transitions
+    from sb3_dce.data.examination import examine_transitions
 
     unknown = replace(transitions.info, findings=(Finding("other", "warning", "something new", 3),))
     found = examine_transitions(replace(transitions, info=unknown), row_penalty(None))
