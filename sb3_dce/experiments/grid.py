@@ -209,8 +209,8 @@ def experiment_ids() -> list[str]:
     """
     :return: names of all experiments, those with runs of table 1 first
     """
-    order = ["table1", "table-adroit-kitchen", "fig-tau", "fig-beta", "fig-ood", "fig-alpha", "fig-cql-q", "fig-cql-return"]
-    order += ["fig-sac", "fig-alpha-return", "bounds", "config-tables", "why-dce-loses"]
+    order = ["table1", "table-adroit-kitchen", "run-times", "fig-tau", "fig-beta", "fig-ood", "fig-alpha", "fig-cql-q"]
+    order += ["fig-cql-return", "fig-sac", "fig-alpha-return", "bounds", "config-tables", "why-dce-loses"]
     names = {e.name.removesuffix(".yml") for e in _grids().iterdir() if e.name.endswith(".yml")} - {"scales"}
     return sorted(names, key=lambda name: order.index(name) if name in order else len(order))
 

@@ -64,6 +64,8 @@ def make_report(evidence: Evidence) -> Report:
         found["run-times"] = tables.runtime_table(evidence)
         found["long"] = tables.long_table(evidence)
         judged.append(reproduction(evidence))
+    elif kind == "run-times":
+        found["run-times"] = tables.runtime_table(evidence)
     elif kind == "figure":
         found["long"] = tables.long_table(evidence)
     elif kind == "bounds":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -340,15 +340,18 @@ def run_times(evidence: Evidence, variant: Variant, dataset_ids: list[str]) -> l
     return runs
 
 
-def fastest_run(evidence: Evidence, variant: Variant, dataset_ids: list[str]) -> RunTime | None:
+def fastest_runs(evidence: Evidence, names: Iterable[str]) -> dict[str, RunTime]:
     """
-    :param evidence: of an experiment with a table
-    :param variant: agent
-    :param dataset_ids: data
-    :return: the run that others disturbed least, of those in float32 if there are any
+    :param evidence: rows
+    :param names: of variants
+    :return: of each variant the run that others disturbed least, of those with the authors' settings in float32
     """
-    runs = run_times(evidence, variant, dataset_ids)
-    return min(runs, key=lambda run: (" " in run.device, run.seconds), default=None)
+    ids, fastest = [name for _, name in evidence.table_rows()], {}
+    for name in names:
+        runs = [run for run in run_times(evidence, evidence.experiment.variant(name), ids) if not run.hastened]
+        if runs:
+            fastest[name] = min(runs, key=lambda run: run.seconds)
+    return fastest
 
 
 def long_table(evidence: Evidence) -> TextTable:
