@@ -23,6 +23,7 @@ from sb3_dce import hyperparams
 from sb3_dce.buffers import OfflineReplayBuffer
 from sb3_dce.data import Transitions, find_file, load_dataset, load_transitions
 from sb3_dce.data.catalog import DatasetSpec, resolve
+from sb3_dce.data.loading import DatasetLike
 from sb3_dce.data.locate import is_path
 from sb3_dce.data.minari import is_minari_name
 from sb3_dce.envs import SpacesEnv, dataset_spaces, make_env_if_possible, own_env
@@ -31,7 +32,6 @@ from sb3_dce.networks import StandardizedExtractor
 from sb3_dce.normalizing import FEWEST_OBSERVATIONS, is_untouched, vec_normalize_of
 from sb3_dce.sb3_checks import check_env_fits
 
-DatasetLike = str | os.PathLike[str] | Transitions
 SelfAttaching = TypeVar("SelfAttaching", bound="AttachingMixin")
 
 
@@ -373,7 +373,7 @@ class AttachingMixin(OffPolicyAlgorithm):
                 module.set_statistics(mean, std)
 
 
-def as_dataset(source: Any) -> DatasetLike:
+def as_dataset(source: DatasetLike) -> str | os.PathLike[str] | Transitions:
     """
     :param source: anything that holds logged steps
     :return: name or path as it is; of everything else the transitions

@@ -20,9 +20,9 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_dce.attaching import DatasetLike
 from sb3_dce.buffers import OfflineReplayBuffer
 from sb3_dce.checks import check_choice, check_number, check_optional, check_seed, check_steps
+from sb3_dce.data.loading import DatasetLike
 from sb3_dce.diagnostics import RECORDED, DiagnosticsMixin
 from sb3_dce.envs import SpacesEnv
 from sb3_dce.errors import ConfigError

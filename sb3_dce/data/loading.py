@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from os import PathLike
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import numpy as np
 
@@ -16,6 +16,25 @@ from sb3_dce.data.locate import find_file
 from sb3_dce.data.minari import folder_of, is_minari_name
 from sb3_dce.data.transitions import Transitions
 from sb3_dce.errors import ConfigError
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from stable_baselines3.common.buffers import ReplayBuffer
+
+
+class EpisodeSource(Protocol):
+    """What a loaded dataset of Minari has."""
+
+    def iterate_episodes(self) -> Iterable[Any]:
+        """
+        :return: episodes
+        """
+
+
+# Whatever holds logged steps; :func:`load_dataset` says what each must contain.
+DatasetLike: TypeAlias = (
+    "str | PathLike[str] | Transitions | Mapping[str, Any] | Sequence[Any] | pd.DataFrame | ReplayBuffer | EpisodeSource"
+)
 
 _READERS: dict[str, Callable[..., Transitions]] = {
     ".npz": Transitions.from_npz,
@@ -55,7 +74,7 @@ def load_transitions(name_or_path: str | PathLike[str], *, sha256: str | None = 
     return read(path, spec=spec, **options)
 
 
-def load_dataset(source: Any, **options: Any) -> Transitions:
+def load_dataset(source: DatasetLike, **options: Any) -> Transitions:
     """
     The front door: whatever holds logged steps becomes a dataset.
 
@@ -89,18 +108,19 @@ def load_dataset(source: Any, **options: Any) -> Transitions:
                 hint="Rename its keys; timeouts, next_observations and episodes (an id per row) may be left out.",
             )
         return Transitions.from_arrays(**source, **options)
-    if isinstance(source, list | tuple) or hasattr(source, "iterate_episodes"):
-        episodes = source if isinstance(source, list | tuple) else source.iterate_episodes()
+    other: Any = source  # told apart by what they have: none of their packages is imported here
+    if isinstance(other, list | tuple) or hasattr(other, "iterate_episodes"):
+        episodes = other if isinstance(other, list | tuple) else other.iterate_episodes()
         arrays: dict[str, Any] = arrays_from_episodes(episodes)
-        space: Any = getattr(source, "action_space", None)  # of a dataset of Minari
+        space: Any = getattr(other, "action_space", None)  # of a dataset of Minari
         given = options.keys() & {"action_low", "action_high", "action_scale"}
         if not given and hasattr(space, "low") and np.isfinite((space.low, space.high)).all():
             options |= {"action_low": np.ravel(space.low), "action_high": np.ravel(space.high)}
         return Transitions.from_arrays(**arrays, **options)
-    if type(source).__module__.partition(".")[0] == "pandas":
-        return Transitions.from_dataframe(source, **options)
-    if hasattr(source, "buffer_size"):
-        return Transitions.from_replay_buffer(source, **options)
+    if type(other).__module__.partition(".")[0] == "pandas":
+        return Transitions.from_dataframe(other, **options)
+    if hasattr(other, "buffer_size"):
+        return Transitions.from_replay_buffer(other, **options)
     raise ConfigError(
         f"a dataset cannot be made of {type(source).__name__}",
         key="source",
