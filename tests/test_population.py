@@ -6,10 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import agents_under_test
 import gymnasium as gym
 import numpy as np
 import pytest
-import test_agents
 import torch as th
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from update_tools import all_tensors, largest_difference, needs_compiler, to_float64
@@ -86,22 +86,22 @@ def test_vec_normalize_is_refused(data: list[Transitions], make_point_mass: Call
         Population([make(data[0], env=env)])
 
 
-@pytest.mark.parametrize("name", test_agents.AGENTS)
+@pytest.mark.parametrize("name", agents_under_test.AGENTS)
 def test_every_agent_can_be_a_member(name: str, data: list[Transitions], tmp_path: Path) -> None:
-    agent = test_agents.AGENTS[name]
+    agent = agents_under_test.AGENTS[name]
 
     def members() -> list[OfflineAlgorithm]:
-        return [test_agents.make(agent, dataset=data[0], seed=seed) for seed in range(2)]
+        return [agents_under_test.make(agent, dataset=data[0], seed=seed) for seed in range(2)]
 
     singles = [model.learn(4, log_interval=None) for model in members()]
     population = Population(members(), own_randomness=True)
     population.train(4)
     for single, member in zip(singles, population.commit(), strict=True):
-        one, other = (test_agents.weights(model) for model in (single, member))
+        one, other = (agents_under_test.weights(model) for model in (single, member))
         # float32, whose products round differently when they are batched
         assert one.keys() == other.keys() and all(th.allclose(one[k], other[k], atol=2e-4) for k in one)
         member.save(tmp_path / "member.zip")
-        obs = test_agents.some_observations()
+        obs = agents_under_test.some_observations()
         acts = [model.predict(obs, deterministic=True)[0] for model in (member, agent.cls.load(tmp_path / "member.zip"))]
         assert np.array_equal(*acts)
 

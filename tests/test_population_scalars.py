@@ -6,9 +6,9 @@ import inspect
 from collections.abc import Iterator
 from typing import Any
 
+import agents_under_test
 import numpy as np
 import pytest
-import test_agents
 import torch as th
 from torch.utils._pytree import tree_leaves
 
@@ -73,7 +73,7 @@ def allowed(cls: type[OfflineAlgorithm]) -> set[str]:
 
 
 def make(name: str, data: Transitions, **kwargs: Any) -> OfflineAlgorithm:
-    return test_agents.make(test_agents.AGENTS[name], dataset=data, policy_kwargs={"net_arch": [8]}, **kwargs)
+    return agents_under_test.make(agents_under_test.AGENTS[name], dataset=data, policy_kwargs={"net_arch": [8]}, **kwargs)
 
 
 def state_of(model: OfflineAlgorithm) -> list[th.Tensor]:
@@ -89,7 +89,7 @@ def difference(one: OfflineAlgorithm, other: OfflineAlgorithm) -> float:
 @pytest.mark.parametrize("name", CASES)
 def test_members_that_differ_in_one_number_each_equal_single_runs(name: str, transitions: Transitions) -> None:
     base, differing = CASES[name]
-    cls = test_agents.AGENTS[name].cls
+    cls = agents_under_test.AGENTS[name].cls
     common = {key: value for key, value in COMMON.items() if key in inspect.signature(cls).parameters}
     differing = {**common, **differing}
     settings = [{**base}, *({**base, key: value} for key, value in differing.items())]
@@ -111,7 +111,7 @@ def test_members_that_differ_in_one_number_each_equal_single_runs(name: str, tra
 @pytest.mark.parametrize("name", CASES)
 def test_every_number_the_update_is_given_may_differ(name: str, transitions: Transitions) -> None:
     """What changes the coefficients of an update is allowed, and what is allowed is under test."""
-    agent, (base, differing) = test_agents.AGENTS[name], CASES[name]
+    agent, (base, differing) = agents_under_test.AGENTS[name], CASES[name]
     tested = {*COMMON, *differing, *("seed", "dataset")}
     not_numbers = {"device", "verbose", "tensorboard_log", "stats_window_size", "gradient_steps", "execution", "d4rl_compat"}
     if name not in ("DCE-without-V", "BC-likelihood"):  # the same class is under test by another name
@@ -154,7 +154,7 @@ def test_adaptive_weight_of_a_member_is_in_its_file(transitions: Transitions, tm
     begun.train(24)
     for k, member in enumerate(begun.commit()):
         member.save(tmp_path / f"{k}.zip")
-    loaded = [test_agents.AGENTS["PBRL"].cls.load(tmp_path / f"{k}.zip") for k in range(2)]
+    loaded = [agents_under_test.AGENTS["PBRL"].cls.load(tmp_path / f"{k}.zip") for k in range(2)]
     for model, saved in zip(loaded, begun.models, strict=True):
         model.set_dataset(transitions)
         assert model.n_ood_weight_decays == saved.n_ood_weight_decays > 0
