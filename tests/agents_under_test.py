@@ -13,9 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3.common.callbacks import (
-    BaseCallback,
-)
+from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_dce import (
     OfflineBC,

@@ -7,13 +7,9 @@ from typing import Any
 import pytest
 from agents_under_test import AGENTS, accepts, make
 
-from sb3_dce import (
-    Transitions,
-)
+from sb3_dce import Transitions
 from sb3_dce.envs import SpacesEnv
-from sb3_dce.errors import (
-    ConfigError,
-)
+from sb3_dce.errors import ConfigError
 
 WRONG: list[tuple[str, Any]] = [
     ("batch_size", 0),

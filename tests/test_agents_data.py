@@ -15,23 +15,14 @@ import pytest
 import torch as th
 from agents_under_test import AGENTS, Agent, Recorder, accepts, make, same, some_observations, weights
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import (
-    EvalCallback,
-)
+from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_dce import (
-    Transitions,
-)
+from sb3_dce import Transitions
 from sb3_dce.envs import SpacesEnv
-from sb3_dce.errors import (
-    CheckpointError,
-    ConfigError,
-    DatasetFormatError,
-    DatasetNotFoundError,
-)
+from sb3_dce.errors import CheckpointError, ConfigError, DatasetFormatError, DatasetNotFoundError
 from sb3_dce.evaluation import evaluate
 from sb3_dce.execution import Engine
 from sb3_dce.networks import StandardizedExtractor

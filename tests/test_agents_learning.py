@@ -25,17 +25,10 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecVideoRecorder
 
-from sb3_dce import (
-    OfflineBC,
-    Transitions,
-)
+from sb3_dce import OfflineBC, Transitions
 from sb3_dce.buffers import OfflineReplayBuffer
 from sb3_dce.envs import SpacesEnv
-from sb3_dce.errors import (
-    ConfigError,
-    DatasetSemanticsError,
-    DivergenceError,
-)
+from sb3_dce.errors import ConfigError, DatasetSemanticsError, DivergenceError
 from sb3_dce.execution import Engine
 
 

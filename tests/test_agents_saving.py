@@ -18,15 +18,8 @@ import pytest
 import torch as th
 from agents_under_test import Agent, accepts, make, same, some_observations, weights
 
-from sb3_dce import (
-    OfflineDCE,
-    Transitions,
-)
-from sb3_dce.errors import (
-    CheckpointError,
-    ConfigError,
-    DivergenceError,
-)
+from sb3_dce import OfflineDCE, Transitions
+from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError
 
 
 @pytest.mark.parametrize("by_stream", [False, True], ids=["path", "stream"])

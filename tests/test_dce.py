@@ -11,17 +11,9 @@ import pytest
 import torch as th
 from agents_under_test import AGENTS, Recorder, count_reads, make, same, some_observations
 
-from sb3_dce import (
-    OfflineDCE,
-    Transitions,
-)
+from sb3_dce import OfflineDCE, Transitions
 from sb3_dce.envs import SpacesEnv
-from sb3_dce.errors import (
-    CheckpointError,
-    ConfigError,
-    DatasetWarning,
-    DivergenceError,
-)
+from sb3_dce.errors import CheckpointError, ConfigError, DatasetWarning, DivergenceError
 
 DCE = AGENTS["DCE"]
 
