@@ -271,11 +271,20 @@ def test_claims_on_places_need_all_the_papers_agents_at_one_length() -> None:
     assert claim_of(results.merge(parts), "C4").outcome == UNTESTED
 
 
-def test_an_advantage_within_chance_is_none() -> None:
+@pytest.mark.parametrize(
+    ("dce", "others", "outcome"),
+    [
+        ([40.0, 41.0, 43.0, 45.0, 46.0], [40.0, 41.0, 42.0, 43.0, 44.0], HELD),
+        ([80.0, 81.0, 83.0, 85.0, 86.0], [40.0, 41.0, 42.0, 43.0, 44.0], NOT_HELD),
+        # so few seeds show no advantage, whether there is one or not
+        ([40.0, 43.0, 46.0], [40.0, 42.0, 44.0], UNTESTED),
+        ([80.0, 83.0, 86.0], [40.0, 42.0, 44.0], NOT_HELD),
+    ],
+)
+def test_an_advantage_within_chance_is_none(dce: list[float], others: list[float], outcome: str) -> None:
     experts = [f"{task}-medium-expert-sb3" for task in ("halfcheetah", "hopper", "walker2d")]
-    for dce, outcome in (([40.0, 43.0, 46.0], HELD), ([80.0, 83.0, 86.0], NOT_HELD), ([80.0], UNTESTED)):
-        rows = table_rows(TABLE, {name: scores(DCE=dce) for name in experts})
-        assert claim_of(rows, "C6").outcome == outcome
+    rows = table_rows(TABLE, {name: {**{agent: others for agent in AGENTS}, "DCE": dce} for name in experts})
+    assert claim_of(rows, "C6").outcome == outcome
 
 
 @pytest.mark.parametrize(

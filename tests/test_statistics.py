@@ -11,10 +11,12 @@ from sb3_dce.experiments.statistics import (
     Interval,
     bootstrap_interval,
     iqm,
+    mean_interval,
     mean_of_tasks,
     performance_profile,
     probability_of_improvement,
     sample_std,
+    student_quantile,
     total,
     trimmed_mean,
 )
@@ -113,7 +115,23 @@ def test_intervals_that_touch_overlap() -> None:
     assert not Interval(0.0, 1.0).overlaps(Interval(1.1, 2.0))
 
 
-def test_iqm_and_profile_are_over_all_runs_and_not_over_tasks() -> None:
+def test_iqm_is_over_all_runs_and_not_over_tasks() -> None:
     # 0 0 [0 0 1 2] 3 100
     assert iqm([np.zeros(4), np.array([1.0, 2.0, 3.0, 100.0])]) == 0.75
-    assert performance_profile([np.array([10.0]), np.full(3, 20.0)], np.array([15.0])).tolist() == [0.75]
+
+
+def test_a_task_with_more_seeds_weighs_no_more() -> None:
+    few, many = [np.array([10.0]), np.array([0.0, 30.0])], [np.array([10.0]), np.array([0.0, 0.0, 0.0, 30.0, 30.0, 30.0])]
+    assert iqm(few) == pytest.approx(iqm(many)) == 10.0
+    limits = np.array([5.0, 15.0])
+    assert performance_profile(few, limits).tolist() == performance_profile(many, limits).tolist() == [0.75, 0.25]
+
+
+@pytest.mark.parametrize(("freedom", "quantile"), [(1, 12.706), (2, 4.303), (4, 2.776), (7, 2.365), (20, 2.086), (60, 2.000)])
+def test_student_quantile_is_that_of_the_tables(freedom: float, quantile: float) -> None:
+    assert student_quantile(freedom) == pytest.approx(quantile, rel=3e-3)
+
+
+def test_interval_of_a_mean_reaches_beyond_the_range_of_three_seeds() -> None:
+    low, high = mean_interval(np.array([1.0, 2.0, 3.0]))
+    assert (low, high) == pytest.approx((2.0 - 4.303 / 3**0.5, 2.0 + 4.303 / 3**0.5))

@@ -13,7 +13,7 @@ from sb3_dce.experiments import results
 from sb3_dce.experiments.claims import claim_table
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import load_experiment
-from sb3_dce.experiments.judging import CLOSE, HELD, NOT_HELD, UNTESTED, standard_error
+from sb3_dce.experiments.judging import CLOSE, HELD, NOT_HELD, UNTESTED, uncertainty
 from sb3_dce.experiments.reports import reproduction
 from sb3_dce.experiments.verdicts import verdicts
 from sb3_dce.theory import shift_factor
@@ -80,7 +80,7 @@ def test_claims_fail_on_numbers_that_break_them(name: str, metric: str, values: 
     [
         ("fig-cql-return", {"DCE": 45, "Eq. 18": 40}, "Eq. 18 is better on halfcheetah"),
         ("fig-cql-return", {"DCE": 40, "Eq. 18": 45}, "Eq. 18 is better on halfcheetah"),
-        ("fig-sac", {"SAC, alpha auto": 5, "SAC with V, alpha auto": 4}, "SAC with V returns more than SAC"),
+        ("fig-sac", {"SAC, alpha auto": 15, "SAC with V, alpha auto": 14}, "SAC with V returns more than SAC"),
         ("fig-beta", {"beta 0": 5, "SAC without V": 9}, "better than SAC without V"),
         ("fig-beta", {"beta 0": 0, "beta 2": 40, "beta 4": 44, "beta 8": 45}, "Beta 8 is too much"),
         (
@@ -89,10 +89,38 @@ def test_claims_fail_on_numbers_that_break_them(name: str, metric: str, values: 
             "At alpha 3 both are below",
         ),
         ("fig-tau", {f"expectile 0.{n}": 3 * (n - 5) for n in (5, 6, 7, 8, 9)}, "little difference on half"),
+        ("fig-tau", {f"expectile 0.{n}": n for n in (5, 6, 7, 8, 9)}, "little difference on half"),
     ],
 )
 def test_what_seeds_alone_could_do_is_too_close_to_tell(name: str, values: dict[str, float], claim: str) -> None:
     assert one_of(outcomes(name, scored(name, {CHEETAH: values})), claim) == CLOSE
+
+
+def test_little_difference_needs_more_than_one_seed() -> None:
+    experiment = load_experiment("fig-tau")
+    runs = [
+        run_rows(experiment, f"expectile 0.{n}", CHEETAH, seed, curves={"score": [40.0 + n / 2 + seed] * 10})
+        for n in (5, 6, 7, 8, 9)
+        for seed in range(3)
+    ]
+    assert one_of(outcomes("fig-tau", results.merge(runs)), "little difference on half") == HELD
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "claim"),
+    [
+        ("fig-sac", {"SAC, alpha auto": -2, "SAC with V, alpha auto": 4}, "SAC with V returns more than SAC"),
+        ("fig-cql-return", {"DCE": 4, "Eq. 18": -30}, "Eq. 18 is better on halfcheetah"),
+    ],
+)
+def test_two_agents_that_fail_are_not_compared(name: str, values: dict[str, float], claim: str) -> None:
+    assert one_of(outcomes(name, scored(name, {CHEETAH: values})), claim) == UNTESTED
+
+
+@pytest.mark.parametrize(("alphas", "outcome"), [((0.50, 0.52, 0.54), CLOSE), ((0.5, 0.4, 0.9), NOT_HELD)])
+def test_alpha_rises_by_more_than_seeds_can_do(alphas: tuple[float, ...], outcome: str) -> None:
+    values = {f"beta {b}": alpha for b, alpha in zip((1, 2, 4), alphas, strict=True)}
+    assert one_of(outcomes("fig-alpha", scored("fig-alpha", {CHEETAH: values}, "ent_coef")), "rises with beta") == outcome
 
 
 def test_seeds_that_agree_tell_a_smaller_difference() -> None:
@@ -121,7 +149,6 @@ def test_seeds_that_agree_tell_a_smaller_difference() -> None:
         ("fig-beta", "score", {"beta 0": 60, "SAC without V": 40}, "better than SAC without V"),
         ("fig-sac", "q_data", {"SAC, alpha 1": 100, "SAC with V, alpha 1": 40}, "far lower (paper: 4000 and 400), alpha 1"),
         ("fig-alpha", "ent_coef", {f"beta {b}": b / 10 for b in (0, 1, 2, 4, 8)}, "rises with beta"),
-        ("fig-tau", "score", {f"expectile 0.{n}": n for n in (5, 6, 7, 8, 9)}, "little difference on half"),
     ],
 )
 def test_claims_hold_on_numbers_that_bear_them_out(name: str, metric: str, values: dict[str, float], claim: str) -> None:
@@ -158,9 +185,18 @@ def test_dropout_has_to_help_somewhere_and_hurt_nowhere(pairs: Any, outcome: str
     data = ("pen-human-v0", "door-human-v0")
     rows = table_rows(
         adroit,
-        {d: {"DCE": [float(a)] * 2, "DCE without dropout": [float(b)] * 2} for d, (a, b) in zip(data, pairs, strict=True)},
+        {
+            d: {name: [value - 4.0, float(value), value + 4.0] for name, value in (("DCE", a), ("DCE without dropout", b))}
+            for d, (a, b) in zip(data, pairs, strict=True)
+        },
     )
     assert one_of(outcomes("table-adroit-kitchen", rows), "Dropout of the critics") == outcome
+
+
+def test_two_seeds_on_demonstrations_of_people_tell_nothing_of_dropout() -> None:
+    adroit = load_experiment("table-adroit-kitchen")
+    rows = table_rows(adroit, {"pen-human-v0": {"DCE": [90.0, 92.0], "DCE without dropout": [20.0, 22.0]}})
+    assert one_of(outcomes("table-adroit-kitchen", rows), "Dropout of the critics") == UNTESTED
 
 
 def test_best_on_every_set_is_not_best_on_one() -> None:
@@ -171,14 +207,13 @@ def test_best_on_every_set_is_not_best_on_one() -> None:
     assert one_of(outcomes("table1", rows), "C4") == NOT_HELD
 
 
-def test_claims_on_seeds_and_speed() -> None:
+def test_claim_on_seeds() -> None:
     table = load_experiment("table1")
     hopper = "hopper-medium-sb3"
-    for spread, seconds, expected in ((30.0, (10.0, 90.0), HELD), (1.0, (90.0, 10.0), NOT_HELD)):
-        parts = [run_rows(table, "DCE", hopper, s, 40.0 + s * spread, seconds=seconds[0]) for s in range(2)]
-        rows = results.merge([*parts, run_rows(table, "CQL", hopper, 0, 40.0, seconds=seconds[1])])
+    for spread, expected in ((30.0, HELD), (1.0, NOT_HELD)):
+        rows = results.merge(run_rows(table, "DCE", hopper, s, 40.0 + s * spread) for s in range(2))
         lines = {row[0]: row[2] for row in claim_table({"table1": Evidence(table, rows, table.scales["cpu"])}, {}).rows}
-        assert (lines["C3"], lines["C7"]) == (expected, expected)
+        assert lines["C7"] == expected
     steady = results.merge(run_rows(table, "DCE", CHEETAH, s, 40.0 + s) for s in range(2))
     lines = {row[0]: row[2] for row in claim_table({"table1": Evidence(table, steady, table.scales["cpu"])}, {}).rows}
     assert lines["C7"] == UNTESTED, "the claim is about Hopper and people's demonstrations"
@@ -202,6 +237,12 @@ def test_an_agent_that_diverges_has_failed() -> None:
     assert one_of(outcomes("fig-beta", results.merge([works, sac])), "better than SAC without V") == HELD
     both = results.merge([lost("fig-beta", "beta 0"), sac])
     assert one_of(outcomes("fig-beta", both), "better than SAC without V") == UNTESTED
+    returns = load_experiment("fig-cql-return")
+    some = [run_rows(returns, "DCE", CHEETAH, seed, curves={"score": [90.0] * 10}) for seed in range(2)]
+    some += [lost("fig-cql-return", "DCE").assign(seed=2)]
+    some += [run_rows(returns, "Eq. 18", CHEETAH, seed, curves={"score": [20.0 + seed] * 10}) for seed in range(3)]
+    found = outcomes("fig-cql-return", results.merge(some))
+    assert one_of(found, "Eq. 18 is better on halfcheetah") == HELD, "its other seeds do not make up for the one it lost"
     table, names = load_experiment("table1"), [f"halfcheetah-{k}-sb3" for k in ("random", "medium", "medium-replay")]
     agents = {v.name: [40.0] for v in table.variants}
     parts = [table_rows(table, {name: {**agents, "DCE": [90.0]} for name in names})]
@@ -230,10 +271,17 @@ def test_first_by_a_hair_is_not_best() -> None:
         assert one_of(outcomes("table1", rows), "C4") == outcome
 
 
-def test_two_seeds_that_disagree_are_not_taken_for_sure() -> None:
-    assert standard_error(np.array([10.0, 70.0])) == pytest.approx(30.0)
-    assert standard_error(np.array([40.0, 40.0])) == pytest.approx(4.2 / np.sqrt(2))
-    assert standard_error(np.array([40.0])) == 4.2 and standard_error(np.array([1.0, 1.0, 1.0])) == 0.0
+def test_few_seeds_are_taken_to_spread_as_much_as_any_agent_on_the_data() -> None:
+    table = load_experiment("table1")
+
+    def errors(**scores: list[float]) -> list[float]:
+        evidence = Evidence(table, table_rows(table, {CHEETAH: scores}), table.scales["cpu"])
+        return [uncertainty(evidence, table.variant(name), CHEETAH).error for name in scores]
+
+    assert errors(DCE=[10.0, 70.0]) == [pytest.approx(30.0)]
+    assert errors(DCE=[40.0, 40.0]) == [pytest.approx(4.2 / np.sqrt(2))]
+    assert errors(DCE=[40.0], BC=[1.0, 1.0, 1.0]) == [4.2, 0.0]
+    assert errors(DCE=[40.0], IQL=[10.0, 20.0, 30.0]) == [10.0, pytest.approx(10.0 / np.sqrt(3))]
 
 
 @pytest.mark.parametrize(("alphas", "outcome"), [((0.2, 0.3, 0.5, 0.25), HELD), ((0.2, 0.3, 0.35, 0.25), NOT_HELD)])
@@ -242,14 +290,18 @@ def test_alpha_differs_between_data_sets_by_a_factor(alphas: tuple[float, ...], 
     data = [entry.twin for entry in experiment.datasets[:4]]
     rows = scored("fig-alpha", {str(d): {"beta 4": a} for d, a in zip(data, alphas, strict=True)}, "ent_coef")
     assert one_of(outcomes("fig-alpha", rows), "between data sets (MuJoCo)") == outcome
+    cheetahs = [str(d) for d in data if str(d).startswith("halfcheetah")]
+    rows = scored("fig-alpha", {d: {"beta 4": 0.1 * 9**i} for i, d in enumerate(cheetahs)}, "ent_coef")
+    assert one_of(outcomes("fig-alpha", rows), "between data sets (MuJoCo)") == UNTESTED, "two sets of one task"
 
 
 @pytest.mark.parametrize(("slope", "outcome"), [(0.5, HELD), (2.0, NOT_HELD), (0.97, CLOSE)])
 def test_flatter_curve_is_the_one_that_varies_less(slope: float, outcome: str) -> None:
     experiment = load_experiment("fig-cql-q")
     curves = {"expectile 0.7": [float(i) for i in range(25)], "without policy": [slope * i for i in range(25)]}
-    rows = results.merge(run_rows(experiment, name, CHEETAH, 0, curves={"q_data": q}) for name, q in curves.items())
-    assert one_of(outcomes("fig-cql-q", rows), "Q is flatter") == outcome
+    for n_updates, expected in ((100_000, outcome), (50_000, UNTESTED)):  # before, Q is on the way to its level
+        rows = [run_rows(experiment, n, CHEETAH, 0, curves={"q_data": q}, n_updates=n_updates) for n, q in curves.items()]
+        assert one_of(outcomes("fig-cql-q", results.merge(rows)), "Q is flatter") == expected
 
 
 def test_claims_on_demonstrations_of_people_are_not_tested_on_those_of_a_policy() -> None:
@@ -266,3 +318,5 @@ def test_constant_alpha_varies_if_one_set_varies(scores: list[float], outcome: s
     adroit = load_experiment("table-adroit-kitchen")
     rows = table_rows(adroit, {"pen-human-v0": {"DCE": scores}, "hammer-human-v0": {"DCE": [40.0, 41.0]}})
     assert one_of(outcomes("table-adroit-kitchen", rows), "constant alpha") == outcome
+    hammer = table_rows(adroit, {"hammer-human-v0": {"DCE": [40.0, 41.0]}})
+    assert one_of(outcomes("table-adroit-kitchen", hammer), "constant alpha") == UNTESTED, "not even the paper's varies there"

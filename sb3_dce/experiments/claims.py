@@ -33,7 +33,7 @@ def claim_table(evidences: Mapping[str, Evidence], judged: Mapping[str, list[Ver
         ("C10", "V is bounded by 2 tau R_max / (1 - gamma)", UNTESTED, "derived; no experiment of the paper shows it"),
         ("C11", "beta could be found automatically", UNTESTED, "named as future work"),
     ]
-    caption = "Outcomes are about the data and lengths named with each table below; rules and numbers stand with the figures."
+    caption = "Outcomes are about the data and lengths named with each table below; rules stand here or with these."
     return TextTable(("", "claim", "outcome", "numbers"), tuple(rows), caption)
 
 
@@ -118,7 +118,7 @@ def _own_total() -> str:
 
 
 def _outcome(verdict: Verdict) -> tuple[str, str, str]:
-    return verdict.claim, verdict.outcome, verdict.numbers
+    return verdict.claim, verdict.outcome, f"{verdict.numbers}; rule: {verdict.rule}"
 
 
 def _labelled(judged: list[Verdict], label: str) -> tuple[str, str, str, str]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import Variant, settings_in_force
-from sb3_dce.experiments.judging import CLEARLY, differs, standard_error
+from sb3_dce.experiments.judging import CLEARLY, CLOSE, differs, uncertainty
 from sb3_dce.experiments.tables import TextTable
 from sb3_dce.schedules import StepSchedule
 
@@ -89,22 +89,24 @@ def verdict_of(evidence: Evidence, dataset_id: str) -> str:
     if dce is None or not rivals:
         return "not tested"
     best = max(rivals, key=rivals.__getitem__)
+    variant = experiment.variant("DCE")
+    own = uncertainty(evidence, variant, dataset_id)
     if dce >= rivals[best]:
         return f"not behind ({best} {rivals[best]:.1f})"
+    if differs(rivals[best] - dce, uncertainty(evidence, experiment.variant(best), dataset_id), own) == CLOSE:
+        return f"not clearly behind ({best} {rivals[best]:.1f})"
     causes = []
-    variant = experiment.variant("DCE")
     margin = lowest_margin(evidence, variant, dataset_id)
     if (evidence.start(variant, dataset_id, "data_n_terminals") or 0) > 0 and margin is not None and margin < 0:
         causes.append(f"survival condition broken (margin {margin:.2f})")
     gap = rivals[best] - dce
     changes = [v for v in experiment.variants if v.algo == variant.algo and not _is_same(evidence, v, variant, dataset_id)]
     changed = {v.name: score for v in changes if (score := scores[v.name]) is not None}
-    own = evidence.last(variant, dataset_id)
     for v in changes:
         name, score = v.name, changed.get(v.name)
         if score is None or score - dce < SHARE * gap:
             continue
-        if differs(score - dce, standard_error(evidence.last(v, dataset_id)), standard_error(own)) is True:
+        if differs(score - dce, uncertainty(evidence, v, dataset_id), own) is True:
             causes.append(f"{name} closes {(score - dce) / gap:.0%}")
     half, end = halves(evidence, variant, dataset_id)
     if half is not None and end is not None and end - half >= SHARE * gap:

@@ -332,7 +332,8 @@ class Evidence:
         text += f"Data: {'; '.join(data)}. Gradient steps: {_listed(lengths)}; seeds: {_listed(counts)}; last policy"
         text += f", {_listed(episodes)} episodes" if episodes else ""
         text += f". Code {', '.join(sorted(rows['code_version'].unique()))}."
-        changed = {v.name: known for v in shown if (known := self._scale_settings(v))}
+        ran = [v for v in shown if any(len(self.runs(v, n)) or len(self.of_other_length(v, n)) for n in ids)]
+        changed = {v.name: known for v in ran if (known := self._scale_settings(v))}
         if changed and self.scale.source != "embedded":
             text += " At this scale " + "; ".join(f"{name} has {settings}" for name, settings in changed.items()) + "."
         hidden = [f"{k} of {n:,} steps on {name}" for name in ids for n, k in self.of_other_lengths.get(name, {}).items()]

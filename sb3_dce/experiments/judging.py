@@ -14,7 +14,7 @@ import numpy as np
 
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import Variant
-from sb3_dce.experiments.statistics import sample_std
+from sb3_dce.experiments.statistics import sample_std, student_quantile
 
 HELD, NOT_HELD, CLOSE, UNTESTED = "held", "did not hold", "too close to tell", "could not be tested"
 
@@ -22,10 +22,13 @@ TENTH = "means over the last tenth of the run"
 # Standard deviation of the score over seeds where there are fewer than three: DCE after 50,000 steps on
 # halfcheetah-medium-sb3, five seeds (docs/results/halfcheetah-medium-sb3.md).
 SEED_STD = 4.2
+SEED_STD_FREEDOM = 4
 CLEARLY = (
-    f"clearly: by more than two standard errors over seeds, with a standard deviation of at least {SEED_STD:g} (measured for "
-    "DCE on HalfCheetah) where there are fewer than three seeds"
+    "clearly: outside of the 95 % interval of Welch's test over seeds; an agent with fewer than three has the largest "
+    f"standard deviation of any agent on these data, at least {SEED_STD:g} (DCE on HalfCheetah, five seeds)"
 )
+# Below this score a policy does not do its task, so that comparisons of it say nothing.
+WORKING = 5.0
 
 
 class Verdict(NamedTuple):
@@ -34,12 +37,24 @@ class Verdict(NamedTuple):
     :param rule: when it counts as borne out
     :param outcome: "held", "did not hold", "too close to tell" or "could not be tested"
     :param numbers: what the rule was applied to
+    :param is_check: whether it is about formulas or files of ours, so that no run could refute it
     """
 
     claim: str
     rule: str
     outcome: str
     numbers: str
+    is_check: bool = False
+
+
+class Uncertainty(NamedTuple):
+    """
+    :param error: standard error of a mean over seeds
+    :param freedom: degrees of freedom of its estimate
+    """
+
+    error: float
+    freedom: float
 
 
 def judge(claim: str, rule: str, holds: bool | str | None, numbers: str) -> Verdict:
@@ -62,7 +77,7 @@ class Values(dict[str, float]):
 
     :ivar scope: data, length and seeds they rest on
     :ivar other_kind: how the data differ in kind from those that the paper's claim is about; empty if they do not
-    :ivar errors: standard error over seeds of each, for scores
+    :ivar errors: uncertainty over seeds of each, for scores
     """
 
     scope = ""
@@ -70,7 +85,7 @@ class Values(dict[str, float]):
 
     def __init__(self, values: Iterable[tuple[str, float]] = ()) -> None:
         super().__init__(values)
-        self.errors: dict[str, float] = {}
+        self.errors: dict[str, Uncertainty] = {}
 
     def text(self, digits: int = 1) -> str:
         """
@@ -88,8 +103,8 @@ def values_of(evidence: Evidence, names: list[str], metric: str, dataset: str | 
     :param names: of variants
     :param metric: name
     :param dataset: D4RL id; ``None`` for the grid's first
-    :return: value of each variant at the end of its runs: mean of the last tenth, over seeds; of scores minus infinity if
-        all diverged; ``None`` if one is missing
+    :return: value of each variant at the end of its runs: mean of the last tenth, over seeds; of scores minus infinity if a
+        run diverged, since then the agent has failed; ``None`` if one is missing
     """
     dataset_id = evidence.id_of(dataset)
     if dataset_id is None:
@@ -98,25 +113,30 @@ def values_of(evidence: Evidence, names: list[str], metric: str, dataset: str | 
     variants = [evidence.experiment.variant(name) for name in names]
     for variant in variants:
         value = evidence.tail(variant, dataset_id, metric)
-        if value is None and metric == "score" and all_diverged(evidence, variant, dataset_id):
+        if metric == "score" and evidence.n_diverged(variant, dataset_id):
             value = -math.inf
         if value is None:
             return None
         values[variant.name] = value
-        values.errors[variant.name] = standard_error(evidence.last(variant, dataset_id))
+        values.errors[variant.name] = uncertainty(evidence, variant, dataset_id)
     values.scope = evidence.scope(dataset_id, variants)
     values.other_kind = evidence.other_kind(dataset)
     return values
 
 
-def standard_error(scores: np.ndarray) -> float:
+def uncertainty(evidence: Evidence, variant: Variant, dataset_id: str) -> Uncertainty:
     """
-    :param scores: of one agent, one per seed
-    :return: standard error of their mean, from ``SEED_STD`` up where fewer than three seeds say little on it
+    :param evidence: rows
+    :param variant: agent
+    :param dataset_id: data
+    :return: of the mean of its last scores. One or two seeds say little on their spread: there it is the largest of all agents
+        on these data, from ``SEED_STD`` up
     """
-    n = max(1, len(scores))
-    spread = sample_std(scores) if n > 2 else max(SEED_STD, sample_std(scores)) if n == 2 else SEED_STD
-    return spread / float(np.sqrt(n))
+    n = max(1, len(evidence.last(variant, dataset_id)))
+    if n > 2:
+        return Uncertainty(sample_std(evidence.last(variant, dataset_id)) / math.sqrt(n), n - 1)
+    known = [scores for v in evidence.experiment.variants if len(scores := evidence.last(v, dataset_id)) > 1]
+    return Uncertainty(max([SEED_STD, *map(sample_std, known)]) / math.sqrt(n), SEED_STD_FREEDOM)
 
 
 def above(values: Values | None, first: str, second: str) -> bool | str | None:
@@ -131,14 +151,19 @@ def above(values: Values | None, first: str, second: str) -> bool | str | None:
     return differs(values[first] - values[second], values.errors[first], values.errors[second])
 
 
-def differs(difference: float, one: float, other: float) -> bool | str:
+def differs(difference: float, one: Uncertainty, other: Uncertainty) -> bool | str:
     """
     :param difference: of two scores
-    :param one: standard error of the first
-    :param other: standard error of the second
-    :return: whether it is positive, ``CLOSE`` within two standard errors
+    :param one: uncertainty of the first
+    :param other: uncertainty of the second
+    :return: whether it is positive, ``CLOSE`` within the 95 % interval of Welch's test
     """
-    return CLOSE if abs(difference) <= 2.0 * float(np.hypot(one, other)) else difference > 0
+    squares = [each.error**2 for each in (one, other)]
+    variance = sum(squares)
+    if variance == 0.0:
+        return CLOSE if difference == 0 else difference > 0
+    freedom = variance**2 / sum(s**2 / each.freedom for s, each in zip(squares, (one, other), strict=True))
+    return CLOSE if abs(difference) <= student_quantile(freedom) * math.sqrt(variance) else difference > 0
 
 
 def all_of(parts: Iterable[bool | str | None]) -> bool | str | None:

@@ -48,6 +48,9 @@ def write_page(path: Path, out: Path, evidences: Mapping[str, Evidence], reports
         "Data whose names end in `-sb3` are made with this package. They stand in for D4RL's sets and are not these: scores "
         "on them cannot be compared with published ones, which stand beside them in columns of their own, under the D4RL id "
         "they belong to. Scores are those of the last policy, with D4RL's constants, in the version 4 environments.",
+        "The paper trains for 1,000,000 steps (500,000 in figures) with five seeds. How long and how often we did stands with "
+        "each number. Its schedules change beta for the first time after 50,000 steps: shorter runs have the first beta "
+        "throughout.",
         f"Verdicts: {count(every)}.",
         "## The paper's claims",
         claim_table(evidences, judged).markdown(),
@@ -85,5 +88,5 @@ def verdict_table(judged: list[Verdict]) -> TextTable:
     :param judged: verdicts
     :return: as a table
     """
-    rows = tuple((v.claim, f"**{v.outcome}**", v.numbers, v.rule) for v in judged)
+    rows = tuple((v.claim, f"**{v.outcome}**" + (" (a check)" if v.is_check else ""), v.numbers, v.rule) for v in judged)
     return TextTable(("claim", "outcome", "numbers", "rule"), rows, "")

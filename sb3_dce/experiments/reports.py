@@ -14,7 +14,7 @@ from sb3_dce.experiments.figures import panel_curves, variants_of
 from sb3_dce.experiments.grid import Variant, source_of
 from sb3_dce.experiments.judging import CLOSE, HELD, NOT_HELD, UNTESTED, Verdict, judge
 from sb3_dce.experiments.paper import paper_score, read_csv
-from sb3_dce.experiments.statistics import bootstrap_interval
+from sb3_dce.experiments.statistics import mean_interval
 from sb3_dce.experiments.tables import TextTable
 from sb3_dce.experiments.verdicts import verdicts
 from sb3_dce.schedules import StepSchedule
@@ -114,11 +114,14 @@ def reproduction(evidence: Evidence) -> Verdict:
     dce = evidence.experiment.variant("DCE")
     for dataset, name in evidence.table_rows():
         cell, scores = paper_score(dataset.paper, "DCE"), evidence.last(dce, name)
-        if source_of(name) != "D4RL" or cell is None or cell.score is None or len(scores) < 2:
+        if source_of(name) != "D4RL" or cell is None or cell.score is None or evidence.n_updates(name) != PAPER_UPDATES:
             continue
-        if evidence.n_updates(name) != PAPER_UPDATES:
+        if evidence.n_diverged(dce, name):
+            misses.append(f"{name} (diverged, paper {cell.score:g})")
             continue
-        low, high = bootstrap_interval([scores])
+        if len(scores) < 2:
+            continue
+        low, high = mean_interval(scores)
         spread = cell.std or 0.0
         met = low <= cell.score + spread and high >= cell.score - spread
         (hits if met else misses).append(f"{name} ({scores.mean():.1f}, paper {cell.score:g})")
@@ -177,7 +180,7 @@ def _toy_verdict(table: TextTable) -> Verdict:
     agreeing = sum(row[-1] == row[-2] for row in table.rows)
     claim = "Claim 4.3: an action outside of the data is preferred exactly if its gain exceeds the difference of the shifts"
     rule = "holds in every row of the linear example"
-    return judge(claim, rule, agreeing == len(table.rows), f"{agreeing} of {len(table.rows)} rows")
+    return judge(claim, rule, agreeing == len(table.rows), f"{agreeing} of {len(table.rows)} rows")._replace(is_check=True)
 
 
 # -- configuration -------------------------------------------------------------------------------------------------
@@ -224,13 +227,19 @@ def common_table() -> TextTable:
 def _config_verdict(table: TextTable) -> Verdict:
     agreeing = sum(row[-1] == "yes" for row in table.rows)
     rule = "alpha and the whole schedule of beta agree in all 23 rows"
-    return judge("The configurations are the paper's", rule, agreeing == 23, f"{agreeing} of {len(table.rows)} rows")
+    verdict = judge("The configurations are the paper's", rule, agreeing == 23, f"{agreeing} of {len(table.rows)} rows")
+    return verdict._replace(is_check=True)
 
 
 def count(judged: list[Verdict]) -> str:
     """
     :param judged: verdicts
-    :return: how many have each outcome
+    :return: how many have each outcome, checks of formulas and files apart
     """
-    numbers = {outcome: sum(v.outcome == outcome for v in judged) for outcome in (HELD, NOT_HELD, CLOSE, UNTESTED)}
-    return ", ".join(f"{n} {outcome}" for outcome, n in numbers.items())
+    claims, checks = ([v for v in judged if v.is_check == wanted] for wanted in (False, True))
+    numbers = {outcome: sum(v.outcome == outcome for v in claims) for outcome in (HELD, NOT_HELD, CLOSE, UNTESTED)}
+    text = ", ".join(f"{n} {outcome}" for outcome, n in numbers.items())
+    if checks:
+        right = sum(v.outcome == HELD for v in checks)
+        text += f"; checks of formulas and files, which no run could refute: {right} of {len(checks)} right"
+    return text

@@ -41,30 +41,57 @@ def sample_std(values: np.ndarray) -> float:
     return float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
 
 
-def trimmed_mean(values: np.ndarray) -> np.ndarray:
+# 97.5 % quantiles of Student's t by degrees of freedom; in between they are nearly linear in the inverse of these.
+_FREEDOM = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 30.0, np.inf])
+_QUANTILES = np.array([12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.306, 2.228, 2.131, 2.042, 1.960])
+
+
+def student_quantile(freedom: float) -> float:
     """
-    Mean of the middle half along the last axis. Where a quarter of the number is not whole, the scores at the edges count
-    with the rest of their weight, so that exactly half of the weight is used.
+    :param freedom: degrees of freedom, from 1 up
+    :return: how many standard errors a two-sided 95 % interval reaches to each side
+    """
+    return float(np.interp(1.0 / freedom, 1.0 / _FREEDOM[::-1], _QUANTILES[::-1]))
+
+
+def mean_interval(scores: np.ndarray) -> Interval:
+    """
+    95 % interval of the mean of one task by Student's t. Of so few seeds a bootstrap draws nothing but their range, which
+    holds the mean in three of four cases only.
+
+    :param scores: one number per seed, at least two
+    :return: bounds
+    """
+    reach = student_quantile(len(scores) - 1) * sample_std(scores) / np.sqrt(len(scores))
+    return Interval(float(scores.mean() - reach), float(scores.mean() + reach))
+
+
+def trimmed_mean(values: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+    """
+    Mean of the middle half of the weight along the last axis. Scores at its edges count with the part of theirs inside.
 
     :param values: shape (..., n)
+    :param weights: positive, shape (n,); ``None`` for equal ones
     :return: shape (...)
     """
-    ordered = np.sort(values, axis=-1)
-    n = ordered.shape[-1]
-    ranks = np.arange(n)
-    # share of the interval [rank, rank + 1] that lies in [n / 4, 3 n / 4]
-    weights = np.clip(np.minimum(ranks + 1, 0.75 * n) - np.maximum(ranks, 0.25 * n), 0.0, 1.0)
-    return ordered @ weights / weights.sum()
+    weights = np.ones(values.shape[-1]) if weights is None else weights
+    order = np.argsort(values, axis=-1)
+    sizes = (weights / weights.sum())[order]
+    ends = np.cumsum(sizes, axis=-1)
+    inside = np.clip(np.minimum(ends, 0.75) - np.maximum(ends - sizes, 0.25), 0.0, None)
+    return (np.take_along_axis(values, order, axis=-1) * inside).sum(axis=-1) / inside.sum(axis=-1)
 
 
 def iqm(scores: Scores) -> np.ndarray:
     """
-    Interquartile mean over all runs of all tasks.
+    Interquartile mean over all runs, in which every task has the same weight, whatever its number of seeds.
 
     :param scores: one array per task, each of shape (..., seeds)
     :return: mean of the middle half, shape (...)
     """
-    return trimmed_mean(np.concatenate([np.asarray(task, dtype=float) for task in scores], axis=-1))
+    tasks = [np.asarray(task, dtype=float) for task in scores]
+    weights = np.concatenate([np.full(task.shape[-1], 1.0 / task.shape[-1]) for task in tasks])
+    return trimmed_mean(np.concatenate(tasks, axis=-1), weights)
 
 
 def mean_of_tasks(scores: Scores) -> np.ndarray:
@@ -116,10 +143,11 @@ def performance_profile(scores: Scores, thresholds: np.ndarray) -> np.ndarray:
     """
     :param scores: one array per task
     :param thresholds: scores, shape (n,)
-    :return: fraction of all runs above each threshold, shape (n,)
+    :return: fraction of the runs above each threshold, mean over tasks, shape (n,)
     """
-    runs = np.concatenate([np.asarray(task, dtype=float) for task in scores])
-    return (runs[:, None] > np.asarray(thresholds, dtype=float)[None, :]).mean(axis=0)
+    limits = np.asarray(thresholds, dtype=float)[None, :]
+    shares = [(np.asarray(task, dtype=float)[:, None] > limits).mean(axis=0) for task in scores]
+    return np.mean(shares, axis=0)
 
 
 class Total(NamedTuple):

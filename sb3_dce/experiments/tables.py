@@ -21,6 +21,7 @@ from sb3_dce.experiments.statistics import (
     Interval,
     bootstrap_interval,
     iqm,
+    mean_interval,
     mean_of_tasks,
     probability_of_improvement,
     sample_std,
@@ -29,8 +30,8 @@ from sb3_dce.experiments.statistics import (
 from sb3_dce.files import write_text
 
 BOLD_RULE = (
-    "Bold: the 95 % bootstrap interval over seeds overlaps that of the best mean of the row (with one seed: the best mean). "
-    "± is the sample standard deviation over seeds. 'After n' are runs of another length than those of the row."
+    "Bold: the 95 % interval over seeds (Student's t) overlaps that of the best mean of the row; none where that has one "
+    "seed. ± is the sample standard deviation over seeds. 'After n' are runs of another length than those of the row."
 )
 
 # A probability from fewer comparisons of single runs says nothing.
@@ -123,12 +124,12 @@ def score_table(evidence: Evidence) -> TextTable:
     return TextTable(header, tuple(rows), f"{evidence.caption(ids)} {BOLD_RULE} {tuned} {MIXED_PROTOCOLS}")
 
 
-def score_cell(evidence: Evidence, variant: Variant, dataset_id: str, best: tuple[float, Interval] | None) -> str:
+def score_cell(evidence: Evidence, variant: Variant, dataset_id: str, best: Interval | None) -> str:
     """
     :param evidence: rows
     :param variant: column
     :param dataset_id: row
-    :param best: best mean of the row and its interval
+    :param best: interval of the best mean of the row, ``None`` if that has one seed
     :return: mean, deviation, number of seeds if it is not the usual one, and how many diverged
     """
     scores, diverged = evidence.last(variant, dataset_id), evidence.n_diverged(variant, dataset_id)
@@ -139,9 +140,7 @@ def score_cell(evidence: Evidence, variant: Variant, dataset_id: str, best: tupl
             return f"{_mean_and_spread(other[0])} (after {other[1]:,})"
         return lost.strip() or "-"
     text = _mean_and_spread(scores)
-    assert best is not None
-    tied = len(scores) > 1 and bootstrap_interval([scores]).overlaps(best[1])
-    if scores.mean() == best[0] or tied:
+    if best is not None and len(scores) > 1 and mean_interval(scores).overlaps(best):
         text = f"**{text}**"
     return text + lost
 
@@ -150,12 +149,9 @@ def _mean_and_spread(scores: np.ndarray) -> str:
     return f"{scores.mean():.1f}" + (f" ± {sample_std(scores):.1f}" if len(scores) > 1 else "")
 
 
-def _best_interval(columns: list[np.ndarray]) -> tuple[float, Interval] | None:
-    known = [scores for scores in columns if len(scores)]
-    if not known:
-        return None
-    best = max(known, key=lambda scores: scores.mean())
-    return float(best.mean()), bootstrap_interval([best])
+def _best_interval(columns: list[np.ndarray]) -> Interval | None:
+    best = max((scores for scores in columns if len(scores)), key=lambda scores: scores.mean(), default=np.empty(0))
+    return mean_interval(best) if len(best) > 1 else None
 
 
 def _paper_cell(dataset: str, method: str) -> str:
@@ -262,7 +258,7 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
         )
     note = (
         f"Over {_counted(len(ids))} on which the paper's agents have runs of one length; those that were run on fewer than "
-        "half of the data are left out. The interval is a "
+        "half of the data are left out. Each data set has the same weight. The interval is a "
         f"stratified bootstrap over seeds within data sets ({N_RESAMPLES:,} resamples; none with one seed); the deviation of "
         f"the total takes the rows as independent. {MIXED_PROTOCOLS}"
     )
@@ -374,7 +370,7 @@ def long_table(evidence: Evidence) -> TextTable:
                 continue
             numbers = ["", "", "", "", "", "", "", ""]
             if len(scores):
-                low, high = bootstrap_interval([scores]) if len(scores) > 1 else (float("nan"), float("nan"))
+                low, high = mean_interval(scores) if len(scores) > 1 else (float("nan"), float("nan"))
                 few = at_end(runs, "score_paper_episodes")
                 curve = curve_of(runs, "score")
                 paper_mode = float(few.mean()) if len(few) else float("nan")
