@@ -23,7 +23,7 @@ from sb3_dce import hyperparams
 from sb3_dce.buffers import OfflineReplayBuffer
 from sb3_dce.data import Transitions, find_file, load_dataset, load_transitions
 from sb3_dce.data.catalog import DatasetSpec, resolve
-from sb3_dce.data.loading import DatasetLike
+from sb3_dce.data.loading import DatasetLike as DatasetLike
 from sb3_dce.data.locate import is_path
 from sb3_dce.data.minari import is_minari_name
 from sb3_dce.envs import SpacesEnv, dataset_spaces, make_env_if_possible, own_env

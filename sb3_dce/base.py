@@ -20,9 +20,9 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_dce.attaching import DatasetLike
 from sb3_dce.buffers import OfflineReplayBuffer
 from sb3_dce.checks import check_choice, check_number, check_optional, check_seed, check_steps
-from sb3_dce.data.loading import DatasetLike
 from sb3_dce.diagnostics import RECORDED, DiagnosticsMixin
 from sb3_dce.envs import SpacesEnv
 from sb3_dce.errors import ConfigError
@@ -42,7 +42,7 @@ from sb3_dce.sb3_checks import (
     named_env,
     policy_arguments,
 )
-from sb3_dce.state import Storage, TrainState
+from sb3_dce.state import LearnedNumber, Storage, TrainState
 
 SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
 
@@ -168,9 +168,6 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
     # Networks of the policy by attribute name. Each becomes an attribute of the agent and a storage of the update; those
     # with an ``optimizer`` are trained, the others are targets or frozen.
     networks: ClassVar[tuple[str, ...]]
-    # Numbers learned beside the networks: attribute of the tensor, ``None`` where the parameters say so, and attribute of its
-    # optimizer. Each becomes a storage of the update and a part of the saved model.
-    learned_numbers: ClassVar[dict[str, str]] = {}
     # Length of the run that these updates belong to, where it is known: what is resumed is executed as it was begun.
     planned_updates: int | None = None
     # Parameters of the subclass in which the members of a population may differ, since they reach the update as numbers.
@@ -189,6 +186,13 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         :return: random numbers one update needs
         """
         raise NotImplementedError
+
+    def learned_numbers(self) -> dict[str, LearnedNumber]:
+        """
+        :return: numbers learned beside the networks, by the attribute of their tensor. Each becomes a storage of the update
+            and a part of the saved model
+        """
+        return {}
 
     def update_variant(self, n_updates: int) -> dict[str, Any]:
         """
@@ -294,26 +298,14 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         self._coef = {}
 
     def setup_extras(self) -> None:
-        """Create what the networks do not hold: the random generator; subclasses add their temperature."""
+        """Create what the networks do not hold: numbers that are learned, and the random generator."""
+        for name, number in self.learned_numbers().items():
+            tensor = None if number.start is None else number.start.to(self.device).requires_grad_(True)
+            setattr(self, name, tensor)
+            optimizer = None if tensor is None else th.optim.Adam([tensor], lr=number.learning_rate)
+            setattr(self, number.optimizer, optimizer)
         if not hasattr(self, "rng_state"):
             self._seed_generator(self.seed)
-
-    def start_number(self, name: str, value: th.Tensor | None, learning_rate: float) -> None:
-        """
-        Create one of :attr:`learned_numbers` and its optimizer.
-
-        :param name: attribute of the tensor
-        :param value: its first value, shape (1,); ``None`` if it is not learned
-        :param learning_rate: of the optimizer
-        """
-        number = None if value is None else value.to(self.device).requires_grad_(True)
-        optimizer = None if number is None else th.optim.Adam([number], lr=learning_rate)
-        setattr(self, name, number)
-        setattr(self, self.learned_numbers[name], optimizer)
-
-    def _numbers(self) -> dict[str, str]:
-        """Those of :attr:`learned_numbers` that are learned."""
-        return {name: optimizer for name, optimizer in self.learned_numbers.items() if getattr(self, name, None) is not None}
 
     def set_random_seed(self, seed: int | None = None) -> None:
         seed = check_seed(seed)
@@ -349,16 +341,21 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         """
         modules = {name: getattr(self, name) for name in self.networks}
         storages = {name: Storage.of(module) for name, module in modules.items() if module is not None}
-        numbers = {name: Storage([getattr(self, name)], getattr(self, opt)) for name, opt in self._numbers().items()}
+        tensors = {name: getattr(self, name) for name in self.learned_numbers()}
+        optimizers = {name: getattr(self, number.optimizer) for name, number in self.learned_numbers().items()}
+        numbers = {name: Storage([tensor], optimizers[name]) for name, tensor in tensors.items() if tensor is not None}
         return {**storages, **numbers}
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), *self.networks, *self.learned_numbers, *self.learned_numbers.values()]
+        numbers = self.learned_numbers()
+        optimizers = [number.optimizer for number in numbers.values()]
+        return [*super()._excluded_save_params(), *self.networks, *numbers, *optimizers]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         modules, tensors = super()._get_torch_save_params()
         trained = [name for name in self.networks if hasattr(getattr(self, name), "optimizer")]
-        numbers = self._numbers()
+        # by the parameters: a temperature fixed since the model was made is saved as one
+        numbers = {name: number.optimizer for name, number in self.learned_numbers().items() if number.start is not None}
         return [*modules, *(f"{name}.optimizer" for name in trained), *numbers.values()], [*tensors, *numbers]
 
     # -- training --------------------------------------------------------------------------------------------------

@@ -11,10 +11,10 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
 
 from sb3_dce import losses
+from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.buffers import OfflineReplayBuffer
 from sb3_dce.checks import check_choice, check_number
-from sb3_dce.data.loading import DatasetLike
 from sb3_dce.data.selection import rows_of_best_episodes
 from sb3_dce.data.transitions import Transitions
 from sb3_dce.errors import ConfigError

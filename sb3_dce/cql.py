@@ -13,16 +13,16 @@ from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, S
 
 from sb3_dce import losses
 from sb3_dce.actor_rate import ActorLearningRate
+from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.checks import check_choice, check_number
-from sb3_dce.data.loading import DatasetLike
 from sb3_dce.ensembles import EnsembleNet
 from sb3_dce.entropy import EntropyCoefficient, stepped_ent_coef
 from sb3_dce.execution import Update, UpdateOptions, bound_update
 from sb3_dce.networks import OfflineCritic
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import OfflineSACPolicy
-from sb3_dce.state import PureNet, Storage
+from sb3_dce.state import LearnedNumber, PureNet, Storage
 from sb3_dce.steps import action_metrics, descend, polyak, q_data_metrics
 
 LAGRANGE = "log_lagrange"  # name of the multiplier's learner in the state tree
@@ -72,7 +72,6 @@ class OfflineCQL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
 
     algo_name: ClassVar[str] = "offline_cql"
     networks = ("actor", "critic", "critic_target")
-    learned_numbers: ClassVar[dict[str, str]] = {**EntropyCoefficient.learned_numbers, LAGRANGE: "lagrange_optimizer"}
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": OfflineSACPolicy}
     population_scalars = frozenset({"cql_weight", "lagrange_threshold"})
     policy: OfflineSACPolicy
@@ -170,10 +169,9 @@ class OfflineCQL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
     def policy_settings(self) -> dict[str, Any]:
         return {**super().policy_settings(), "net_arch": [256, 256, 256]}
 
-    def setup_extras(self) -> None:
-        """Create temperature, multiplier and their optimizers."""
-        super().setup_extras()
-        self.start_number(LAGRANGE, None if self.lagrange_threshold is None else th.zeros(1), self.lr_schedule(1))
+    def learned_numbers(self) -> dict[str, LearnedNumber]:
+        start = None if self.lagrange_threshold is None else th.zeros(1)
+        return {**super().learned_numbers(), LAGRANGE: LearnedNumber("lagrange_optimizer", start, self.lr_schedule(1))}
 
     # -- what the base class needs ---------------------------------------------------------------------------------
 

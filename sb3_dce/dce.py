@@ -11,9 +11,9 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
 
 from sb3_dce import losses
+from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.checks import check_choice, check_number, check_optional
-from sb3_dce.data.loading import DatasetLike
 from sb3_dce.entropy import ENT_COEF, EntropyCoefficient, descend_ent_coef
 from sb3_dce.errors import ConfigError
 from sb3_dce.execution import Update, UpdateOptions, bound_update

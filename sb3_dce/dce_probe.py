@@ -14,7 +14,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from torch import nn
 
-from sb3_dce.data.loading import DatasetLike
+from sb3_dce.attaching import DatasetLike
 from sb3_dce.dce import OfflineDCE
 from sb3_dce.execution import Update
 from sb3_dce.policies import OfflineSACPolicy

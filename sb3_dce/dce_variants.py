@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import torch as th
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from sb3_dce.data.loading import DatasetLike
+from sb3_dce.attaching import DatasetLike
 from sb3_dce.dce import OfflineDCE
 from sb3_dce.policies import OfflineSACPolicy
 

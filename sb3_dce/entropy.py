@@ -11,6 +11,7 @@ import torch as th
 from sb3_dce import losses
 from sb3_dce.errors import ConfigError
 from sb3_dce.optimizers import AdamSettings, Learner
+from sb3_dce.state import LearnedNumber
 from sb3_dce.steps import descend
 
 ENT_COEF = "log_ent_coef"  # name of the learner in the state tree
@@ -41,7 +42,6 @@ class EntropyCoefficient:
     """Mixin of agents with the parameters ``ent_coef`` and ``target_entropy``; the names are those of SB3's SAC."""
 
     population_scalars: ClassVar[frozenset[str]] = frozenset({"ent_coef", "target_entropy"})
-    learned_numbers: ClassVar[dict[str, str]] = {ENT_COEF: "ent_coef_optimizer"}
     ent_coef: str | float
     target_entropy: str | float
     log_ent_coef: th.Tensor | None
@@ -65,12 +65,15 @@ class EntropyCoefficient:
                     hint="'auto' is minus the number of action dimensions.",
                 )
 
-    def setup_extras(self) -> None:
-        """Create the temperature and its optimizer."""
-        super().setup_extras()  # type: ignore[misc]
+    def learned_numbers(self) -> dict[str, LearnedNumber]:
+        """
+        :return: numbers learned beside the networks, by the attribute of their tensor
+        """
         learned, value = parse_ent_coef(self.ent_coef)
         start = th.log(th.full((1,), value)) if learned else None
-        self.start_number(ENT_COEF, start, self.lr_schedule(1))  # type: ignore[attr-defined]
+        rate = self.lr_schedule(1)  # type: ignore[attr-defined]
+        numbers: dict[str, LearnedNumber] = super().learned_numbers()  # type: ignore[misc]
+        return {**numbers, ENT_COEF: LearnedNumber("ent_coef_optimizer", start, rate)}
 
     def coefficients(self, n_updates: int) -> dict[str, float]:
         """

@@ -12,9 +12,9 @@ from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, S
 
 from sb3_dce import losses
 from sb3_dce.actor_rate import ActorLearningRate
+from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.checks import check_number
-from sb3_dce.data.loading import DatasetLike
 from sb3_dce.ensembles import EnsembleNet, EnsemblePolicy
 from sb3_dce.entropy import EntropyCoefficient, stepped_ent_coef
 from sb3_dce.execution import Update, UpdateOptions, bound_update

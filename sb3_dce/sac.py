@@ -10,8 +10,8 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
 
 from sb3_dce import losses
+from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
-from sb3_dce.data.loading import DatasetLike
 from sb3_dce.entropy import ENT_COEF, EntropyCoefficient, descend_ent_coef
 from sb3_dce.execution import Update, UpdateOptions, bound_update
 from sb3_dce.networks import OfflineCritic
@@ -99,9 +99,6 @@ class OfflineSAC(EntropyCoefficient, OfflineAlgorithm):
         self.target_entropy = target_entropy
         if _init_setup_model:
             self._setup_model()
-
-    def check_parameters(self) -> None:
-        super().check_parameters()
 
     def make_update(self, storages: dict[str, Storage]) -> Update:
         nets = {

@@ -8,7 +8,7 @@ its optimizer. The update reads and writes the vectors; ``state_dict()``, ``pred
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch as th
 from stable_baselines3.common.utils import update_learning_rate
@@ -183,6 +183,18 @@ class Storage:
 
 def _flatten(tensors: list[th.Tensor]) -> th.Tensor:
     return th.cat([t.reshape(-1) for t in tensors]).clone()
+
+
+class LearnedNumber(NamedTuple):
+    """
+    :param optimizer: attribute of its optimizer
+    :param start: first value, shape (1,); ``None`` if the parameters say that it is not learned
+    :param learning_rate: of the optimizer, at the start
+    """
+
+    optimizer: str
+    start: th.Tensor | None
+    learning_rate: float
 
 
 class TrainState:

@@ -11,9 +11,9 @@ from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, S
 
 from sb3_dce import losses
 from sb3_dce.actors import DeterministicActor
+from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.checks import check_number
-from sb3_dce.data.loading import DatasetLike
 from sb3_dce.execution import Update, UpdateOptions, bound_update
 from sb3_dce.networks import OfflineCritic
 from sb3_dce.noise import NoiseSpec

@@ -12,12 +12,12 @@ from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, S
 
 from sb3_dce import losses
 from sb3_dce.actor_rate import ActorLearningRate
+from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.checks import check_choice, check_number, check_widths
-from sb3_dce.data.loading import DatasetLike
 from sb3_dce.execution import Update, UpdateOptions, bound_update
 from sb3_dce.noise import NoiseSpec
-from sb3_dce.state import PureNet, Storage
+from sb3_dce.state import LearnedNumber, PureNet, Storage
 from sb3_dce.steps import action_metrics, descend, polyak, q_data_metrics
 from sb3_dce.uwac_networks import ActionVAE, DropoutCritic
 from sb3_dce.uwac_policy import VAE_NET_ARCH, UWACPolicy
@@ -81,7 +81,6 @@ class OfflineUWAC(ActorLearningRate, OfflineAlgorithm):
 
     algo_name: ClassVar[str] = "offline_uwac"
     networks = ("actor", "critic", "critic_target", "vae")
-    learned_numbers: ClassVar[dict[str, str]] = {LOG_ALPHA: "alpha_optimizer"}
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MlpPolicy": UWACPolicy}
     population_scalars = frozenset({"alpha_learning_rate", "uwac_beta", "mmd_sigma", "mmd_threshold"})
     policy: UWACPolicy
@@ -200,10 +199,9 @@ class OfflineUWAC(ActorLearningRate, OfflineAlgorithm):
             "critic_layer_norm": False,  # these critics have spectral normalisation
         }
 
-    def setup_extras(self) -> None:
-        """Create the multiplier of the MMD constraint and its optimizer."""
-        super().setup_extras()
-        self.start_number(LOG_ALPHA, th.zeros(1), self.alpha_learning_rate)
+    def learned_numbers(self) -> dict[str, LearnedNumber]:
+        number = LearnedNumber("alpha_optimizer", th.zeros(1), self.alpha_learning_rate)
+        return {**super().learned_numbers(), LOG_ALPHA: number}
 
     def make_storages(self) -> dict[str, Storage]:
         return {

@@ -27,7 +27,7 @@ from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
 import sb3_dce as package
-from sb3_dce import OfflineBC, OfflineDCE, OfflineSACV, OfflineTD3BC, OfflineUWAC, Transitions
+from sb3_dce import OfflineBC, OfflineDCE, OfflineSACV, OfflineTD3BC, OfflineUWAC, Transitions, agents
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.data import load_transitions
 from sb3_dce.envs import SpacesEnv
@@ -38,11 +38,6 @@ from sb3_dce.rollouts import make_rollouts, rollouts_of
 from tests.commands import sb3_dce
 
 TINY = "halfcheetah-tiny-sb3"
-
-
-@pytest.fixture(params=AGENTS)
-def agent(request: pytest.FixtureRequest) -> Agent:
-    return AGENTS[request.param]
 
 
 class Bounded(gym.Wrapper[Any, Any, Any, Any]):
@@ -435,3 +430,7 @@ def test_examples_run_as_they_are_written(page: str, code: str, tmp_path: Path, 
     code = re.sub(r"learn\(1e\d", "learn(4", code).replace("train(1000)", "train(4)")
     code = re.sub(r'"(walker2d-medium|halfcheetah-demo-sb3)"', f'"{TINY}"', code)
     exec(compile(code, page, "exec"), {})
+
+
+def test_every_agent_is_in_the_battery() -> None:
+    assert {agent.cls for agent in AGENTS.values()} == set(agents.AGENTS.values())

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from os import PathLike
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -17,9 +17,22 @@ from sb3_dce.data.minari import folder_of, is_minari_name
 from sb3_dce.data.transitions import Transitions
 from sb3_dce.errors import ConfigError
 
-if TYPE_CHECKING:
-    import pandas as pd
-    from stable_baselines3.common.buffers import ReplayBuffer
+
+class FrameLike(Protocol):
+    """What a pandas data frame has."""
+
+    @property
+    def columns(self) -> Any:
+        """
+        :return: names
+        """
+
+
+class BufferLike(Protocol):
+    """What a replay buffer of Stable-Baselines3 has."""
+
+    buffer_size: int
+    observations: Any
 
 
 class EpisodeSource(Protocol):
@@ -32,8 +45,16 @@ class EpisodeSource(Protocol):
 
 
 # Whatever holds logged steps; :func:`load_dataset` says what each must contain.
-DatasetLike: TypeAlias = (
-    "str | PathLike[str] | Transitions | Mapping[str, Any] | Sequence[Any] | pd.DataFrame | ReplayBuffer | EpisodeSource"
+DatasetLike = (
+    str
+    | PathLike[str]
+    | Transitions
+    | Mapping[str, Any]
+    | list[Any]
+    | tuple[Any, ...]
+    | FrameLike
+    | BufferLike
+    | EpisodeSource
 )
 
 _READERS: dict[str, Callable[..., Transitions]] = {

@@ -28,6 +28,7 @@ from sb3_dce.experiments.grid import (
 from sb3_dce.theory import beta_eff, shift_factor, value_shift_factor
 
 UPDATES_PER_EPOCH = 1000
+TIMING = "run-times"  # its runs are too short to say anything about scores
 GAMMA, TAU = 0.99, 0.005  # of all DCE runs of the figures (paper, common configuration)
 
 
@@ -51,6 +52,8 @@ class Evidence:
         hash_here: Callable[[str], str | None] = lambda _: None,
     ) -> None:
         self.experiment, self.scale = experiment, scale
+        if experiment.report != TIMING:
+            rows = rows[rows["experiment"] != TIMING]
         self._rows, self._n_updates, self._hash_here = rows, n_updates, hash_here
         self._selected: dict[str, pd.DataFrame] = {}
         self._others: dict[str, pd.DataFrame] = {}

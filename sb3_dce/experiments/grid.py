@@ -146,7 +146,7 @@ class Experiment:
     :param id: name on the command line
     :param title: heading
     :param items: numbers in the list of experiments
-    :param report: "table", "figure", "bounds", "diagnosis" or "configuration"
+    :param report: "table", "run-times", "figure", "bounds", "diagnosis" or "configuration"
     :param datasets: rows, in the paper's order
     :param variants: columns or lines
     :param panels: pictures

@@ -97,8 +97,12 @@ def _run_all(
     if device.type == "cpu":
         here = [replace(spec, device="cpu") for spec in specs]
         return [outcome for outcome in launch_all(here, workers, console) if isinstance(outcome, BaseException)]
-    failures: list[BaseException] = []
-    for group in populations(specs):
+    groups = populations(specs)
+    alone = [replace(group[0], device=str(device)) for group in groups if len(group) == 1]
+    failures = [outcome for outcome in launch_all(alone, 1, console) if isinstance(outcome, BaseException)]
+    for group in groups:
+        if len(group) == 1:
+            continue
         try:
             _train_group(group, device, console)
         except DivergenceError as error:

@@ -28,6 +28,7 @@ from sb3_dce.experiments.statistics import (
     total,
 )
 from sb3_dce.files import write_text
+from sb3_dce.precision import PRECISIONS
 
 BOLD_RULE = (
     "Bold: the 95 % interval over seeds (Student's t) overlaps that of the best mean of the row; none where that has one "
@@ -267,7 +268,7 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
 
 def runtime_table(evidence: Evidence) -> TextTable:
     """
-    :param evidence: of an experiment with a table
+    :param evidence: rows of whole agents
     :return: seconds per 1000 updates beside the paper's, one row per agent, device and precision
     """
     rows = []
@@ -301,6 +302,9 @@ def has_fewer_draws(evidence: Evidence, variant: Variant) -> bool:
     return "n_mc_dropout" in evidence.scale.set_for.get(variant.algo, {})
 
 
+HASTENED = tuple(name for name in PRECISIONS if name != "float32")
+
+
 class RunTime(NamedTuple):
     """
     :param seconds: per 1000 updates
@@ -327,12 +331,13 @@ def run_times(evidence: Evidence, variant: Variant, dataset_ids: list[str]) -> l
     :param dataset_ids: data
     :return: of each complete run, whatever its length, that was trained alone: members of a population have its time together
     """
-    fewer, runs = has_fewer_draws(evidence, variant), []
+    # smoke scale has small networks
+    fewer, runs = has_fewer_draws(evidence, variant) or bool(evidence.scale.set), []
     for name in dataset_ids:
         rows = pd.concat([evidence.runs(variant, name), evidence.of_other_length(variant, name)])
         alone = rows[(rows["metric"] == "seconds") & ~rows["device"].str.contains("population")]
         for value, n_updates, device in zip(alone["value"], alone["n_updates"], alone["device"], strict=True):
-            runs.append(RunTime(1000.0 * value / n_updates, device, fewer or " " in device))
+            runs.append(RunTime(1000.0 * value / n_updates, device, fewer or device.rpartition(" ")[2] in HASTENED))
     return runs
 
 
@@ -340,14 +345,17 @@ def fastest_runs(evidence: Evidence, names: Iterable[str]) -> dict[str, RunTime]
     """
     :param evidence: rows
     :param names: of variants
-    :return: of each variant the run that others disturbed least, of those with the authors' settings in float32
+    :return: of each variant the run that others disturbed least, of those with the authors' settings in float32; all on one
+        file and one kind of device, the one with most of them
     """
-    ids, fastest = [name for _, name in evidence.table_rows()], {}
+    ids = [dataset_id] if (dataset_id := evidence.id_of(None)) is not None else []
+    by_device: dict[str, dict[str, RunTime]] = {}
     for name in names:
-        runs = [run for run in run_times(evidence, evidence.experiment.variant(name), ids) if not run.hastened]
-        if runs:
-            fastest[name] = min(runs, key=lambda run: run.seconds)
-    return fastest
+        for run in run_times(evidence, evidence.experiment.variant(name), ids):
+            known = by_device.setdefault(run.device, {})
+            if not run.hastened and run.seconds <= known.get(name, run).seconds:
+                known[name] = run
+    return max(by_device.values(), key=len, default={})
 
 
 def long_table(evidence: Evidence) -> TextTable:
