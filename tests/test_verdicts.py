@@ -121,6 +121,8 @@ def test_two_agents_that_fail_are_not_compared(name: str, values: dict[str, floa
 def test_alpha_rises_by_more_than_seeds_can_do(alphas: tuple[float, ...], outcome: str) -> None:
     values = {f"beta {b}": alpha for b, alpha in zip((1, 2, 4), alphas, strict=True)}
     assert one_of(outcomes("fig-alpha", scored("fig-alpha", {CHEETAH: values}, "ent_coef")), "rises with beta") == outcome
+    both = {CHEETAH: values, "halfcheetah-medium-replay-sb3": {"beta 1": 0.3, "beta 4": 0.1}}
+    assert one_of(outcomes("fig-alpha", scored("fig-alpha", both, "ent_coef")), "rises with beta") == NOT_HELD
 
 
 def test_seeds_that_agree_tell_a_smaller_difference() -> None:

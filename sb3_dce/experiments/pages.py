@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sb3_dce.experiments.claims import claim_table, own_table_facts
 from sb3_dce.experiments.evidence import Evidence
-from sb3_dce.experiments.judging import Verdict
+from sb3_dce.experiments.judging import CLEARLY, Verdict
 from sb3_dce.experiments.reports import Report, count
 from sb3_dce.experiments.tables import TextTable, parts_of
 from sb3_dce.files import write_text
@@ -52,6 +52,7 @@ def write_page(path: Path, out: Path, evidences: Mapping[str, Evidence], reports
         "each number. Its schedules change beta for the first time after 50,000 steps: shorter runs have the first beta "
         "throughout.",
         f"Verdicts: {count(every)}.",
+        f"In their rules, {CLEARLY}.",
         "## The paper's claims",
         claim_table(evidences, judged).markdown(),
         "## What the paper's own tables say",

@@ -18,7 +18,6 @@ from sb3_dce.experiments.evidence import GAMMA, TAU, Evidence
 from sb3_dce.experiments.figures import probe_difference
 from sb3_dce.experiments.grid import Variant, source_of
 from sb3_dce.experiments.judging import (
-    CLEARLY,
     CLOSE,
     TENTH,
     WORKING,
@@ -92,7 +91,7 @@ def _beta(evidence: Evidence) -> list[Verdict]:
     return [
         judge(
             "With beta 0 the agent does badly: below BC (V alone is not enough)",
-            f"score of beta 0 clearly below that of BC ({TENTH}; {CLEARLY})",
+            f"score of beta 0 clearly below that of BC ({TENTH})",
             above(with_bc, "BC", "beta 0"),
             text_of(with_bc),
         ),
@@ -198,16 +197,26 @@ ALPHA_STEP = student_quantile(4) * math.sqrt(2.0) * 0.043
 
 
 def _alpha(evidence: Evidence) -> list[Verdict]:
-    betas = [f"beta {b}" for b in (1, 2, 4)]
-    first = evidence.experiment.datasets[0].paper
-    values = values_of(evidence, betas, "ent_coef", first)
-    rises: bool | str | None = None
-    if values is not None:
-        logs = np.diff(np.log(list(values.values())))
-        rises = False if (logs < -ALPHA_STEP).any() else True if (logs > ALPHA_STEP).all() else CLOSE
-    rule = f"alpha of beta 1 < 2 < 4, each step by more than {math.exp(ALPHA_STEP) - 1:.0%}, which seeds can do ({TENTH})"
+    experiment = evidence.experiment
+    variants = [experiment.variant(f"beta {b}") for b in (1, 2, 4)]
+    rises: list[bool | str] = []
+    texts = []
+    for dataset, name in evidence.table_rows():
+        values = Values()
+        for v in variants:
+            if v in evidence.variants(dataset) and (value := evidence.tail(v, name, "ent_coef")) is not None:
+                values[v.name] = value
+        if len(values) > 1 and not dataset.is_other_kind(name):
+            logs = np.diff(np.log(list(values.values())))
+            rises.append(False if (logs < -ALPHA_STEP).any() else True if (logs > ALPHA_STEP).all() else CLOSE)
+            values.scope = evidence.scope(name, variants)
+            texts.append(values.text(4))
+    rule = (
+        f"on every set with runs alpha of beta 1 < 2 < 4, each step by more than {math.exp(ALPHA_STEP) - 1:.0%}, which seeds "
+        f"can do ({TENTH})"
+    )
     claim = "The learned alpha rises with beta, within a range"
-    found = [judge(claim, rule, rises, "" if values is None else values.text(4))]
+    found = [judge(claim, rule, all_of(rises) if rises else None, ", ".join(texts))]
     beta4 = evidence.experiment.variant("beta 4")
     for panel in evidence.experiment.panels:
         if panel.over:
@@ -280,7 +289,7 @@ def _cql_return(evidence: Evidence) -> list[Verdict]:
         values = values_of(evidence, ["DCE", "Eq. 18"], "score", dataset)
         other = "DCE" if better == "Eq. 18" else "Eq. 18"
         claim = f"{better} is better on {dataset}'s kind of data"
-        rule = f"clearly higher score, one of them above {WORKING:g} ({TENTH}; {CLEARLY})"
+        rule = f"clearly higher score, one of them above {WORKING:g} ({TENTH})"
         found.append(on_this_kind(claim, rule, _above_working(values, better, other), values))
     return found
 
@@ -318,7 +327,7 @@ def _sac(evidence: Evidence) -> list[Verdict]:
         *found,
         judge(
             "SAC with V returns more than SAC, alpha auto",
-            f"clearly higher score, one of them above {WORKING:g} ({TENTH}; {CLEARLY})",
+            f"clearly higher score, one of them above {WORKING:g} ({TENTH})",
             _above_working(scores, names[1], names[0]),
             text_of(scores),
         ),
@@ -350,7 +359,7 @@ def _alpha_return(evidence: Evidence) -> list[Verdict]:
     return [
         judge(
             "At alpha 3 both are below alpha 1",
-            f"scores, clearly ({TENTH}; {CLEARLY})",
+            f"scores, clearly ({TENTH})",
             all_of(above(pair, f"{agent}, alpha 1", f"{agent}, alpha 3") for agent, pair in zip(agents, pairs, strict=True)),
             text_of(*pairs),
         ),
@@ -421,7 +430,7 @@ def _leading(evidence: Evidence) -> list[Verdict]:
             holds = (False if ahead else True if seeds else None) if everything else None
             rule = (
                 f"nowhere DCE is clearly above every other agent; held with {PAPER_SEEDS} seeds or more, since fewer show no "
-                f"advantage, whether there is one or not ({CLEARLY})"
+                f"advantage, whether there is one or not"
             )
         else:
             # missing agents and data can only add to those that are ahead
@@ -430,7 +439,7 @@ def _leading(evidence: Evidence) -> list[Verdict]:
                 holds = True if all(_is_clearly_ahead(evidence, name, agents) for name in ids) else CLOSE
             rule = (
                 "held: DCE is clearly above all the paper's agents on every such set, at one length; did not hold: on one of "
-                f"the sets an agent is clearly above it, or it diverged ({CLEARLY})"
+                "the sets an agent is clearly above it, or it diverged"
             )
         missing = [name for of in scores.values() for name, s in of.items() if not len(s)]
         absent = [f"{name} on {missing.count(name)} of {len(ids)} sets" for name in sorted(set(missing))]
@@ -489,7 +498,7 @@ def _adroit(evidence: Evidence) -> list[Verdict]:
     holds = None if not ups else False if False in ups else True in ups or CLOSE
     rule = (
         f"clearly higher mean score with dropout 0.1 on a set of people's demonstrations, on none clearly lower; with "
-        f"{FEWEST_SEEDS} seeds or more, since these scores spread by up to 37 in the paper ({CLEARLY})"
+        f"{FEWEST_SEEDS} seeds or more, since these scores spread by up to 37 in the paper"
     )
     found = [judge("Dropout of the critics helps on human demonstrations", rule, holds, numbers)]
     sources = {source_of(name) for name in spreads}
