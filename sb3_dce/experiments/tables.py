@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_dce.data.catalog import resolve
+from sb3_dce.execution import UPDATES_WORTH_COMPILING
 from sb3_dce.experiments.evidence import Evidence, at_end, curve_of
 from sb3_dce.experiments.grid import Variant, source_of, variant_hash
 from sb3_dce.experiments.paper import paper_score, paper_scores
@@ -286,7 +287,8 @@ def runtime_table(evidence: Evidence) -> TextTable:
             how = ", ".join(part for part in (device, settings) if part)
             rows.append((variant.name, how, f"{np.median(rates):.1f}", spread, str(len(rates)), printed))
     note = (
-        "Wall time with evaluations, of runs beside others: an order; benchmarks/results/speed.md measures. Rounded products "
+        "Wall time with evaluations, of runs beside others: an order; benchmarks/results/speed.md measures. On a CPU, runs of "
+        f"up to {UPDATES_WORTH_COMPILING:,} steps are executed eagerly, longer ones compiled. Rounded products "
         f"(bf16-matmul) and fewer draws make an agent faster than the paper's. {MIXED_PROTOCOLS}"
     )
     header = ("agent", "device and precision", "s per 1000 updates (median)", "range", "runs", "paper: s per 1000, RTX 3070")
