@@ -341,10 +341,10 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         """
         modules = {name: getattr(self, name) for name in self.networks}
         storages = {name: Storage.of(module) for name, module in modules.items() if module is not None}
-        tensors = {name: getattr(self, name) for name in self.learned_numbers()}
-        optimizers = {name: getattr(self, number.optimizer) for name, number in self.learned_numbers().items()}
-        numbers = {name: Storage([tensor], optimizers[name]) for name, tensor in tensors.items() if tensor is not None}
-        return {**storages, **numbers}
+        for name, number in self.learned_numbers().items():
+            if (tensor := getattr(self, name)) is not None:
+                storages[name] = Storage([tensor], getattr(self, number.optimizer))
+        return storages
 
     def _excluded_save_params(self) -> list[str]:
         numbers = self.learned_numbers()

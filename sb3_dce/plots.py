@@ -7,9 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sb3_dce.evaluation import Evaluation
-
-# 97.5 % quantiles of Student's t by degrees of freedom.
-STUDENT_T = {1: 12.706, 2: 4.303, 3: 3.182, 4: 2.776, 5: 2.571, 6: 2.447, 7: 2.365, 8: 2.306, 9: 2.262, 10: 2.228}
+from sb3_dce.student import student_quantile
 
 # Names of more lines than this stand beside the picture.
 MOST_INSIDE = 5
@@ -71,9 +69,7 @@ def plot_learning_curves(
 def _interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of the 95 % confidence interval of the mean over the first axis."""
     n = len(values)
-    # From 12 seeds on the expansion of the quantile is exact to 0.01.
-    quantile = STUDENT_T[n - 1] if n - 1 in STUDENT_T else 1.96 + 2.37 / (n - 1) + 2.8 / (n - 1) ** 2
-    half = quantile * values.std(axis=0, ddof=1) / np.sqrt(n)
+    half = student_quantile(n - 1) * values.std(axis=0, ddof=1) / np.sqrt(n)
     mean = values.mean(axis=0)
     return mean - half, mean + half
 

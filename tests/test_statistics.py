@@ -16,10 +16,10 @@ from sb3_dce.experiments.statistics import (
     performance_profile,
     probability_of_improvement,
     sample_std,
-    student_quantile,
     total,
     trimmed_mean,
 )
+from sb3_dce.student import student_quantile
 
 
 def test_interquartile_mean_of_one_to_eight() -> None:

@@ -6,11 +6,10 @@ from collections.abc import Mapping
 
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.judging import HELD, NOT_HELD, UNTESTED, Values, Verdict, judge, lengths_and_seeds
-from sb3_dce.experiments.paper import gym_rows, leaders, paper_score, paper_scores, paper_total
+from sb3_dce.experiments.paper import PAPER_SEEDS, gym_rows, leaders, paper_score, paper_scores, paper_total
 from sb3_dce.experiments.statistics import sample_std
 from sb3_dce.experiments.tables import RunTime, TextTable, fastest_runs
 
-PAPER_SEEDS = 5
 TABLES = ("table1", "table-adroit-kitchen")
 ADROIT = [f"{task}-{kind}-v0" for kind in ("human", "cloned") for task in ("pen", "hammer", "door", "relocate")]
 KITCHEN = ["kitchen-complete-v0", "kitchen-partial-v0", "kitchen-mixed-v0"]

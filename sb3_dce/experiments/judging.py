@@ -14,7 +14,8 @@ import numpy as np
 
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import Variant
-from sb3_dce.experiments.statistics import sample_std, student_quantile
+from sb3_dce.experiments.statistics import sample_std
+from sb3_dce.student import student_quantile
 
 HELD, NOT_HELD, CLOSE, UNTESTED = "held", "did not hold", "too close to tell", "could not be tested"
 

@@ -15,6 +15,7 @@ from typing import NamedTuple
 from sb3_dce.experiments.statistics import Total, total
 
 METHODS = ("BC", "UWAC", "PBRL", "IQL", "TD3-BC", "CQL", "DCE")
+PAPER_SEEDS = 5
 TABLES = {"table1": "gym", "table-adroit-kitchen": "adroit_kitchen"}
 
 

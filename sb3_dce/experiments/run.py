@@ -100,9 +100,7 @@ def _run_all(
     groups = populations(specs)
     alone = [replace(group[0], device=str(device)) for group in groups if len(group) == 1]
     failures = [outcome for outcome in launch_all(alone, 1, console) if isinstance(outcome, BaseException)]
-    for group in groups:
-        if len(group) == 1:
-            continue
+    for group in (group for group in groups if len(group) > 1):
         try:
             _train_group(group, device, console)
         except DivergenceError as error:

@@ -13,6 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sb3_dce.student import student_quantile
+
 Scores = Sequence[np.ndarray]
 
 N_RESAMPLES = 2000
@@ -39,19 +41,6 @@ def sample_std(values: np.ndarray) -> float:
     :return: standard deviation with divisor n - 1; NaN for one seed
     """
     return float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
-
-
-# 97.5 % quantiles of Student's t by degrees of freedom; in between they are nearly linear in the inverse of these.
-_FREEDOM = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 15.0, 30.0, np.inf])
-_QUANTILES = np.array([12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.306, 2.228, 2.131, 2.042, 1.960])
-
-
-def student_quantile(freedom: float) -> float:
-    """
-    :param freedom: degrees of freedom, from 1 up
-    :return: how many standard errors a two-sided 95 % interval reaches to each side
-    """
-    return float(np.interp(1.0 / freedom, 1.0 / _FREEDOM[::-1], _QUANTILES[::-1]))
 
 
 def mean_interval(scores: np.ndarray) -> Interval:

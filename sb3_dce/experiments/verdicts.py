@@ -37,8 +37,10 @@ from sb3_dce.experiments.judging import (
     uncertainty,
     values_of,
 )
-from sb3_dce.experiments.statistics import sample_std, student_quantile
+from sb3_dce.experiments.paper import PAPER_SEEDS
+from sb3_dce.experiments.statistics import sample_std
 from sb3_dce.experiments.tables import fastest_runs
+from sb3_dce.student import student_quantile
 from sb3_dce.theory import penalty_bound
 
 
@@ -217,8 +219,8 @@ def _alpha(evidence: Evidence) -> list[Verdict]:
     )
     claim = "The learned alpha rises with beta, within a range"
     found = [judge(claim, rule, all_of(rises) if rises else None, ", ".join(texts))]
-    beta4 = evidence.experiment.variant("beta 4")
-    for panel in evidence.experiment.panels:
+    beta4 = experiment.variant("beta 4")
+    for panel in experiment.panels:
         if panel.over:
             alphas, names = Values(), [name for name in map(evidence.id_of, panel.over) if name is not None]
             for name in names:
@@ -373,8 +375,6 @@ def _alpha_return(evidence: Evidence) -> list[Verdict]:
     ]
 
 
-# Fewer cannot show that there is no advantage.
-PAPER_SEEDS = 5
 RUN_TIME_ORDER = ("BC", "IQL", "DCE", "CQL", "UWAC")
 # "<<" of the order of run times.
 FAR_SLOWER = 3.0
