@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import sys
+import tempfile
+import traceback
 import warnings
 from pathlib import Path
 from typing import Annotated, Any
@@ -289,7 +291,10 @@ def _parse_lengths(pairs: list[str]) -> dict[str, int]:
 
 
 def main() -> None:
-    """Entry point: errors of this package are one message on stderr and exit code 2, never a traceback."""
+    """
+    Entry point: errors of this package are one message on stderr and exit code 2, others exit code 1 and a report in a file;
+    never a traceback. Ctrl-C is exit code 130, typer's.
+    """
     warnings.showwarning = _show_warning  # type: ignore[assignment]
     for stream in (sys.stdout, sys.stderr):  # an encoding without a sign such as ± is no reason to end a training
         if isinstance(stream, io.TextIOWrapper):
@@ -304,9 +309,16 @@ def main() -> None:
         named = f" ({error.filename})" if error.filename else ""
         Console(stderr=True, highlight=False, soft_wrap=True).print(f"Error: {error.strerror or error}{named}", markup=False)
         sys.exit(2)
-    except KeyboardInterrupt:
-        Console(stderr=True).print("\nInterrupted. The same command goes on from the last checkpoint.")
-        sys.exit(130)
+    except Exception as error:
+        # A mistake of ours, or memory that ran out: what happened is kept for a report, and is no page in the terminal.
+        with tempfile.NamedTemporaryFile("w", prefix="sb3-dce-", suffix=".txt", delete=False, encoding="utf-8") as file:
+            file.write(traceback.format_exc())
+        Console(stderr=True, highlight=False, soft_wrap=True).print(
+            f"Error: {type(error).__name__}: {str(error).strip()[:500]}\nThis should have been said more clearly. The whole "
+            f"report, for an issue: {file.name}",
+            markup=False,
+        )
+        sys.exit(1)
 
 
 def _show_warning(message: Warning | str, category: type[Warning], *_: Any) -> None:

@@ -124,8 +124,11 @@ def quoted(path: str | PathLike[str]) -> str:
 def check_writable(target: pathlib.Path) -> None:
     """
     :param target: file to be written later; missing folders are created
-    :raises CheckpointError: if its folder cannot be made or written
+    :raises CheckpointError: if it is a folder, or its folder cannot be made or written
     """
+    if target.is_dir():
+        hint = f"Name a file, for example {target / 'results.md'}."
+        raise CheckpointError("a folder is no file to write", where=str(target), path=target, hint=hint)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=target.parent):

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import multiprocessing as mp
-import queue
 import sys
+import threading
+import time
 import traceback
-from collections.abc import Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import connection
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +22,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from sb3_dce import runs
 from sb3_dce.errors import DivergenceError, SB3DCEError
 from sb3_dce.evaluation import Evaluation
-from sb3_dce.processes import prepare_worker, threads_from_environment, usable_cores
+from sb3_dce.processes import prepare_worker, termination_as_interrupt, threads_from_environment, usable_cores
 from sb3_dce.runs import RunSpec
 
 # With more runs than this the bars of those that are done make room for the others.
 BARS_KEPT = 20
+# How long runs may take to save when they are interrupted: the rest of an evaluation, or of compiling.
+SAVING_SECONDS = 120.0
 
 
 class RunFailedError(SB3DCEError):
@@ -39,54 +44,149 @@ def launch(specs: Sequence[RunSpec], workers: int, console: Console) -> list[dic
     :param console: where progress and evaluations are shown
     :return: results in the order of ``specs``
     :raises SB3DCEError: the first error of a run; what the others have done is kept and resumed by the same call
+    :raises KeyboardInterrupt: on Ctrl-C or SIGTERM, after each run that was under way has saved where it is
     """
-    try:
-        return [future.result() for future in _launch(specs, workers, console, keep_going=False)]
-    except BrokenProcessPool as error:
-        raise _killed() from error
+    return [future.result() for future in _launch(specs, workers, console, keep_going=False)]
 
 
 def launch_all(specs: Sequence[RunSpec], workers: int, console: Console) -> list[dict[str, Any] | BaseException]:
     """
-    Run all, in parallel processes; one that fails does not stop the others.
+    Run all, in parallel processes; one that fails, or whose process is killed, does not stop the others.
 
     :param specs: what is to be run
     :param workers: processes at a time
     :param console: where progress and evaluations are shown
     :return: results in the order of ``specs``, or the error of the run
+    :raises KeyboardInterrupt: on Ctrl-C or SIGTERM, after each run that was under way has saved where it is
     """
     futures = _launch(specs, workers, console, keep_going=True)
-    outcomes = [future.exception() or future.result() for future in futures]
-    return [_killed() if isinstance(outcome, BrokenProcessPool) else outcome for outcome in outcomes]
+    return [future.exception() or future.result() for future in futures]
 
 
-def _killed() -> RunFailedError:
-    return RunFailedError(
-        "a training process was ended from outside, as the system does when memory is short",
-        hint="Use fewer --workers; the same command goes on from the last checkpoints. A script that starts processes must do "
-        'so below if __name__ == "__main__":.',
-    )
+class _Workers:
+    """
+    A process for each thread that asks for one; it trains one run after the other.
 
+    Nothing is shared that a process could hold when the system kills it, as it does when memory is short: a pool of several
+    would fail as a whole, and a lock of a common queue would stay closed for the others.
 
-def _launch(specs: Sequence[RunSpec], workers: int, console: Console, keep_going: bool) -> list[Future[Any]]:
-    workers = max(1, min(workers, len(specs)))
-    # The user's own setting wins: more threads than free cores make PyTorch many times slower.
-    threads = threads_from_environment() or max(1, usable_cores() // workers)
-    context = mp.get_context("spawn")
-    events = context.Queue()
-    with progress_display(console) as display:
-        with ProcessPoolExecutor(workers, mp_context=context, initializer=_prepare, initargs=(threads, events)) as pool:
-            futures = [pool.submit(_run, spec) for spec in specs]
+    :param threads: of PyTorch in each process
+    """
+
+    def __init__(self, threads: int) -> None:
+        self._threads, self._context = threads, mp.get_context("spawn")
+        self._own, self._lock = threading.local(), threading.Lock()
+        self._pools: list[ProcessPoolExecutor] = []
+        self._events: list[Connection] = []
+        self._stop = self._context.RawValue("b", 0)
+        self._ended = False
+
+    def run(self, spec: RunSpec) -> dict[str, Any]:
+        """
+        :param spec: what is to be run
+        :return: its result
+        :raises RunFailedError: if its process is killed; the next run of this thread gets a new one
+        """
+        try:
+            return self._submit(spec).result()
+        except BrokenProcessPool as error:
+            self._own.pool = None
+            raise RunFailedError(
+                f"the process of {spec.name} was ended from outside, as the system does when memory is short",
+                hint="Use fewer --workers; the same command goes on from the last checkpoint. A script that starts processes "
+                'must do so below if __name__ == "__main__":.',
+            ) from error
+
+    def _submit(self, spec: RunSpec) -> Future[dict[str, Any]]:
+        with self._lock:
+            if self._ended:
+                raise CancelledError
+            pool = getattr(self._own, "pool", None)
+            if pool is not None:
+                return pool.submit(_run, spec)
+            events, end = self._context.Pipe(duplex=False)
+            arguments = (self._threads, end, self._stop)
+            self._own.pool = pool = ProcessPoolExecutor(1, mp_context=self._context, initializer=_prepare, initargs=arguments)
+            self._pools.append(pool)
+            self._events.append(events)
+            future = pool.submit(_run, spec)
+            end.close()  # the process has it now, and with the process it closes
+            return future
+
+    def next_events(self, seconds: float) -> list[runs.Progress]:
+        """
+        :param seconds: how long to wait for one
+        :return: reports of runs, none if nothing has happened
+        """
+        with self._lock:
+            open_ends = list(self._events)
+        if not open_ends:
+            time.sleep(seconds)
+            return []
+        events = []
+        ready = connection.wait(open_ends, seconds)
+        for end in (end for end in open_ends if end in ready):
             try:
-                _show_until_done(futures, events, specs, display, keep_going)
-                return futures
-            except BaseException:
-                # Without this an error or Ctrl-C would wait for every other run to finish.
-                for future in futures:
-                    future.cancel()
-                for process in list(pool._processes.values()):
-                    process.terminate()
-                raise
+                events.append(end.recv())
+            except (EOFError, OSError):
+                with self._lock:
+                    self._events.remove(end)
+        return events
+
+    def save_and_end(self) -> None:
+        """Tell all runs to save where they are, and to end."""
+        self._stop.value = 1
+
+    def terminate(self) -> None:
+        """End the processes at once, whatever they are doing."""
+        with self._lock:
+            self._ended = True
+        for pool in self._pools:
+            for process in list((pool._processes or {}).values()):
+                process.terminate()
+
+    def close(self) -> None:
+        """Let the processes go, which have nothing left to do."""
+        for pool in self._pools:
+            pool.shutdown()
+
+
+def _launch(specs: Sequence[RunSpec], n_workers: int, console: Console, keep_going: bool) -> list[Future[Any]]:
+    n_workers = max(1, min(n_workers, len(specs)))
+    # The user's own setting wins: more threads than free cores make PyTorch many times slower.
+    workers = _Workers(threads_from_environment() or max(1, usable_cores() // n_workers))
+    with progress_display(console) as display, ThreadPoolExecutor(n_workers) as threads:
+        futures = [threads.submit(workers.run, spec) for spec in specs]
+        try:
+            with termination_as_interrupt():
+                try:
+                    _show_until_done(futures, workers, specs, display, keep_going)
+                except KeyboardInterrupt:
+                    _save_and_end(futures, workers, display.console)
+                    raise
+            return futures
+        except BaseException:
+            # Without this an error would wait for every other run to finish.
+            for future in futures:
+                future.cancel()
+            workers.terminate()
+            raise
+        finally:
+            workers.close()
+
+
+def _save_and_end(futures: Sequence[Future[Any]], workers: _Workers, console: Console) -> None:
+    """Let each run save where it is; a second Ctrl-C does not wait for that."""
+    console.print("Interrupted: saving what is being trained. Ctrl-C again ends at once.", markup=False)
+    for future in futures:
+        future.cancel()
+    workers.save_and_end()
+    try:
+        late = wait(futures, SAVING_SECONDS).not_done
+    except KeyboardInterrupt:
+        late = {future for future in futures if not future.done()}
+    where = "the last checkpoints" if late else "there"
+    console.print(f"The same command goes on from {where}.", markup=False)
 
 
 def progress_display(console: Console) -> Progress:
@@ -109,27 +209,26 @@ def progress_display(console: Console) -> Progress:
 
 
 def _show_until_done(
-    futures: list[Future[Any]], events: Any, specs: Sequence[RunSpec], display: Progress, keep_going: bool
+    futures: list[Future[Any]], workers: _Workers, specs: Sequence[RunSpec], display: Progress, keep_going: bool
 ) -> None:
     tasks: dict[str, TaskID] = {}
     totals = {spec.name: spec.n_updates for spec in specs}
     while True:
-        try:
-            event = events.get(timeout=0.2)
-        except queue.Empty:
+        events = workers.next_events(0.2)
+        if not events:
             failed = [future for future in futures if future.done() and future.exception() is not None]
             if failed and not keep_going:
                 failed[0].result()
             if all(future.done() for future in futures):
                 return
-            continue
-        if event.name not in tasks:
-            tasks[event.name] = display.add_task(event.name, total=totals[event.name])
-        display.update(tasks[event.name], completed=event.n_updates)
-        if event.n_updates >= totals[event.name] and len(specs) > BARS_KEPT:
-            display.remove_task(tasks.pop(event.name))
-        if event.evaluation is not None:
-            show_evaluation(display.console, event.name, event.evaluation)
+        for event in events:
+            if event.name not in tasks:
+                tasks[event.name] = display.add_task(event.name, total=totals[event.name])
+            display.update(tasks[event.name], completed=event.n_updates)
+            if event.n_updates >= totals[event.name] and len(specs) > BARS_KEPT:
+                display.remove_task(tasks.pop(event.name))
+            if event.evaluation is not None:
+                show_evaluation(display.console, event.name, event.evaluation)
 
 
 def show_evaluation(console: Console, name: str, outcome: Evaluation) -> None:
@@ -143,27 +242,30 @@ def show_evaluation(console: Console, name: str, outcome: Evaluation) -> None:
     console.print(line, highlight=False)
 
 
-# Where a worker process reports to; set when it starts, since a queue cannot be sent with each task.
+# Where a worker process reports to, and what tells it to save and end; set when it starts, since neither can be sent with
+# each task.
 _events: Any = None
+_stop: Any = None
 
 
-def _prepare(threads: int, events: Any) -> None:
-    global _events
-    _events = events
+def _prepare(threads: int, events: Connection, stop: Any) -> None:
+    global _events, _stop
+    _events, _stop = events, stop
     prepare_worker()
     th.set_num_threads(threads)
 
 
 def _run(spec: RunSpec) -> dict[str, Any]:
-    return train_one(spec, _events.put)
+    return train_one(spec, _events.send, lambda: bool(_stop.value))
 
 
-def train_one(spec: RunSpec, report: runs.Report) -> dict[str, Any]:
+def train_one(spec: RunSpec, report: runs.Report, stop: Callable[[], bool] = lambda: False) -> dict[str, Any]:
     """
     One of many runs of a process.
 
     :param spec: what is to be run
     :param report: called with the progress
+    :param stop: asked after every update whether to save and end
     :return: its result
     :raises DivergenceError: if it diverges, which is also written down in its folder
     :raises SB3DCEError: for other errors; the report of an unexpected one is in ``error.txt`` of the folder
@@ -172,7 +274,7 @@ def train_one(spec: RunSpec, report: runs.Report) -> dict[str, Any]:
         # What was compiled for an earlier run would stay in memory, and be asked at each call whether it fits.
         th.compiler.reset()
     try:
-        return runs.run(spec, report)
+        return runs.run(spec, report, stop)
     except DivergenceError as error:
         runs.write_divergence(Path(spec.folder), int(error.index or 0), error.what)
         raise

@@ -187,7 +187,7 @@ class BatchedRuns:
             self._seconds_before = saved["seconds"]
         for spec, model, folder in zip(self.specs, models, self.folders, strict=True):
             folder.mkdir(parents=True, exist_ok=True)
-            write_config(spec, model, folder, f"{self._device.type}, population of {len(models)}")
+            write_config(spec, model, folder, self._device, len(models))
             self._loggers.append(Logger(str(folder), [make_output_format("csv", str(folder), f"_{population.n_updates}")]))
         return population
 

@@ -58,7 +58,7 @@ def matmul_precision(precision: str, device: th.device) -> Iterator[None]:
     if precision == "float32":
         yield
         return
-    reason = _missing(precision, device)
+    reason = missing_for(precision, device)
     if reason is not None:
         _warn_once(f"precision={precision!r} needs {reason}: computing in float32.")
         yield
@@ -76,8 +76,14 @@ def matmul_precision(precision: str, device: th.device) -> Iterator[None]:
         switch.fp32_precision = before
 
 
-def _missing(precision: str, device: th.device) -> str | None:
-    """What the device lacks, None if nothing."""
+def missing_for(precision: str, device: th.device) -> str | None:
+    """
+    :param precision: as for :func:`matmul_precision`
+    :param device: where the model lies
+    :return: what it takes and is not here, in words; ``None`` if nothing
+    """
+    if precision == "float32":
+        return None
     if precision == "tf32":
         if not hasattr(th.backends.cuda.matmul, "fp32_precision"):
             return "PyTorch 2.9 or later"

@@ -8,6 +8,8 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 
@@ -37,6 +39,24 @@ class UninterruptedBlock:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         if self._asked and kind is None:
             raise KeyboardInterrupt
+
+
+@contextmanager
+def termination_as_interrupt() -> Iterator[None]:
+    """
+    While the block runs, SIGTERM, which batch systems send before they kill, raises ``KeyboardInterrupt`` as Ctrl-C does.
+
+    Only in the main thread, where Python delivers signals, and only if nobody else handles this one.
+    """
+    here = threading.current_thread() is threading.main_thread()
+    replaced = here and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    if replaced:
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        if replaced:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def threads_from_environment() -> int:

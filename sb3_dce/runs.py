@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from importlib.metadata import version
@@ -26,14 +26,17 @@ from stable_baselines3.common.logger import Logger, make_output_format
 import sb3_dce
 from sb3_dce.agents import agent_class
 from sb3_dce.base import OfflineAlgorithm
+from sb3_dce.configuration import NOT_HYPERPARAMETERS, defaults_of, row_of
 from sb3_dce.data import find_file
 from sb3_dce.data.hashes import sha256_once
 from sb3_dce.data.locate import catalogue_id, short_name
 from sb3_dce.data.locking import held
-from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError
+from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError, SB3DCEError
 from sb3_dce.evaluation import Evaluation, EvaluationCallback, write_evaluations
 from sb3_dce.files import cannot_write, write_text
+from sb3_dce.precision import missing_for
 from sb3_dce.rollouts import rollouts_of
+from sb3_dce.saving import saved_timesteps
 
 OTHER_FOLDER = "Choose another folder with --out, or delete this one."
 BEGIN_ANEW = "Delete the run's folder to run it anew, or choose another one with --out."
@@ -91,25 +94,31 @@ Report = Callable[[Progress], None]
 
 
 class _ReportCallback(BaseCallback):
-    def __init__(self, spec: RunSpec, report: Report) -> None:
+    def __init__(self, spec: RunSpec, report: Report, stop: Callable[[], bool]) -> None:
         super().__init__()
-        self._spec, self._report, self._next = spec, report, 0.0
+        self._spec, self._report, self._stop, self._next = spec, report, stop, 0.0
 
     def _on_step(self) -> bool:
         now = time.monotonic()
         if now >= self._next or self.num_timesteps == self._spec.n_updates:
             self._next = now + REPORT_INTERVAL
             self._report(Progress(self._spec.name, self.num_timesteps, self._spec.n_updates))
-        return True
+        return not self._stop()
 
 
-def run(spec: RunSpec, report: Report = lambda progress: None) -> dict[str, Any]:
+class StoppedError(SB3DCEError):
+    """A run was told to end before its time; it has saved a checkpoint."""
+
+
+def run(spec: RunSpec, report: Report = lambda progress: None, stop: Callable[[], bool] = lambda: False) -> dict[str, Any]:
     """
     Train, evaluate and save; go on from the last checkpoint if there is one; do nothing if the run is complete.
 
     :param spec: what is to be run
     :param report: called with the progress
+    :param stop: asked after every update whether to save a checkpoint and end
     :return: the result, also written as ``result.json``
+    :raises StoppedError: if ``stop`` says so
     :raises DivergenceError: if it diverges, or has diverged before, and would do the same again
     :raises SB3DCEError: if something is wrong with data, parameters or files
     """
@@ -122,6 +131,7 @@ def run(spec: RunSpec, report: Report = lambda progress: None) -> dict[str, Any]
         return done
     seen = _stage(folder)
     model = _model(spec, folder)
+    _check_frequency(spec, model)
     model.attach_dataset()
     try:
         folder.mkdir(parents=True, exist_ok=True)  # not before: a run that is refused leaves nothing behind
@@ -134,7 +144,7 @@ def run(spec: RunSpec, report: Report = lambda progress: None) -> dict[str, Any]
                 return done
             model = _model(spec, folder)
             model.attach_dataset()
-        return _train(spec, model, folder, report)
+        return _train(spec, model, folder, report, stop)
 
 
 def _stage(folder: Path) -> list[int | None]:
@@ -162,10 +172,11 @@ def alone(folder: Path) -> Iterator[None]:
         yield
 
 
-def _train(spec: RunSpec, model: OfflineAlgorithm, folder: Path, report: Report) -> dict[str, Any]:
+def _train(spec: RunSpec, model: OfflineAlgorithm, folder: Path, report: Report, stop: Callable[[], bool]) -> dict[str, Any]:
     model.planned_updates = spec.n_updates
     dataset_id = catalogue_id(model.dataset)
     write_config(spec, model, folder)
+    _forget_logs_after(folder, model.num_timesteps)
     formats = [make_output_format("csv", str(folder), f"_{model.num_timesteps}")]
     if model.tensorboard_log is not None:
         name = f"{spec.algo}_{short_name(spec.dataset)}_{spec.seed}"
@@ -185,10 +196,13 @@ def _train(spec: RunSpec, model: OfflineAlgorithm, folder: Path, report: Report)
     if remaining > 0:
         model.learn(
             remaining,
-            callback=[evaluating, _ReportCallback(spec, report)],
+            callback=[evaluating, _ReportCallback(spec, report, stop)],
             log_interval=min(1000, spec.eval_freq),
             reset_num_timesteps=False,
         )
+    if model.num_timesteps < spec.n_updates:
+        model.save(folder / "checkpoint.zip")
+        raise StoppedError(f"{spec.name} was ended after {model.num_timesteps:,} updates", where=str(folder))
     seconds = seconds_before + time.monotonic() - started
     model.save(folder / "model.zip")
     write_evaluations(folder, evaluating.evaluations)
@@ -285,8 +299,8 @@ def _config(spec: RunSpec) -> dict[str, Any]:
 
 def refuse_other_run(spec: RunSpec, folder: Path) -> None:
     """
-    A run is only continued with the settings it was begun with; it may be made longer, unless a learning rate follows its
-    length: the longer run would be another one from its first step on.
+    A run is only continued with the settings it was begun with, those of the hyperparameter file among them; it may be made
+    longer, unless a learning rate follows its length: the longer run would be another one from its first step on.
 
     :param spec: what is to be run
     :param folder: where a run may have been begun
@@ -298,12 +312,12 @@ def refuse_other_run(spec: RunSpec, folder: Path) -> None:
     begun, data = (part if isinstance(part, dict) else {} for part in (config.get("run"), config.get("dataset")))
     wanted = _plain(_config(spec))
     differing = [key for key in wanted if key not in ("n_updates", "dataset") and begun.get(key) != wanted[key]]
-    done = read_result(folder)
     length = begun.get("n_updates")
-    shorter = done is not None and done["n_updates"] > spec.n_updates
-    if shorter or (length != wanted["n_updates"] and _depends_on_length(config)):
+    if _reached(folder) > spec.n_updates or (length != wanted["n_updates"] and _depends_on_length(config)):
         differing.append("n_updates")
     changes = [f"{key}={begun.get(key)!r} there, {wanted[key]!r} now" for key in differing]
+    if not changes:
+        changes = _changed_hyperparameters(spec, config)
     # The same data may be named otherwise: by an id, from another folder, after a move.
     there, now = str(data.get("sha256")), sha256_once(find_file(spec.dataset)[0])
     if there != now:
@@ -315,6 +329,31 @@ def refuse_other_run(spec: RunSpec, folder: Path) -> None:
             path=folder,
             hint=OTHER_FOLDER,
         )
+
+
+def _reached(folder: Path) -> int:
+    """Gradient steps of what lies in the folder; an interrupted run can be cut no more than a complete one."""
+    done, checkpoint = read_result(folder), folder / "checkpoint.zip"
+    reached = 0 if done is None else int(done["n_updates"])
+    with suppress(CheckpointError):  # a damaged one is said when it is loaded, with what to do
+        reached = max(reached, saved_timesteps(checkpoint) if checkpoint.is_file() else 0)
+    return reached
+
+
+def _changed_hyperparameters(spec: RunSpec, config: dict[str, Any]) -> list[str]:
+    """What a changed row of the hyperparameter file, or a default of another version, would make of the run."""
+    there = config.get("hyperparameters")
+    there = there if isinstance(there, dict) else {}
+    data = find_file(spec.dataset)[1]
+    in_force = {**defaults_of(spec.algo), **row_of(spec.algo, None if data is None else data.id), **spec.overrides}
+    changes = []
+    for name, value in in_force.items():
+        # networks are told by the row or by none; a schedule is a function, which has no value to compare
+        if name in NOT_HYPERPARAMETERS or name not in there or callable(value) or (name == "policy_kwargs" and not value):
+            continue
+        if there[name] != (now := _plain(value)):
+            changes.append(f"{name}={there[name]!r} there, {now!r} now, by the hyperparameter file or the default")
+    return changes
 
 
 def _depends_on_length(config: dict[str, Any]) -> bool:
@@ -341,10 +380,30 @@ def check_before_running(specs: Sequence[RunSpec]) -> None:
             continue
         made.append(settings)
         try:
-            agent_class(spec.algo).load_dataset(spec.dataset, seed=spec.seed, **{"device": "cpu", **spec.overrides})
+            agent = agent_class(spec.algo)
+            model = agent.load_dataset(spec.dataset, seed=spec.seed, **{"device": "cpu", **spec.overrides})
+            _check_frequency(spec, model)
         except ConfigError as error:
             where = f"{spec.algo}, {error.where}" if error.where else spec.algo
             raise ConfigError(error.what, where=where, hint=error.hint, key=error.key) from error
+        except SB3DCEError:
+            raise
+        except Exception as error:  # of PyTorch or Stable-Baselines3: networks too large for the memory, an unknown keyword
+            raise ConfigError(
+                f"the agent cannot be made with its settings: {type(error).__name__}: {str(error).strip()[:300]}",
+                where=spec.algo,
+                hint="Check policy_kwargs and what else was set.",
+            ) from error
+
+
+def _check_frequency(spec: RunSpec, model: OfflineAlgorithm) -> None:
+    """``learn`` would refuse it, too, but only when the folder is already that of a run with this setting."""
+    if spec.eval_freq % model.gradient_steps:
+        raise ConfigError(
+            f"eval_freq={spec.eval_freq} is no multiple of gradient_steps={model.gradient_steps}",
+            key="eval_freq",
+            hint="Make it one, or leave gradient_steps at 1.",
+        )
 
 
 def read_config(folder: Path) -> dict[str, Any] | None:
@@ -386,6 +445,15 @@ def _model(spec: RunSpec, folder: Path) -> OfflineAlgorithm:
     return model
 
 
+def _forget_logs_after(folder: Path, n_updates: int) -> None:
+    """
+    Logs that begin after the point from which a run goes on: its checkpoint was deleted, and what they tell is trained anew.
+    """
+    for path in folder.glob("progress_*.csv"):
+        if int(path.stem.rpartition("_")[2]) > n_updates:
+            path.unlink()
+
+
 def _seconds_before(folder: Path) -> float:
     """Training seconds before an interruption, from the log files."""
     total = 0.0
@@ -400,17 +468,21 @@ def _seconds_before(folder: Path) -> float:
     return total
 
 
-def write_config(spec: RunSpec, model: OfflineAlgorithm, folder: Path, device: str | None = None) -> None:
+def write_config(
+    spec: RunSpec, model: OfflineAlgorithm, folder: Path, device: th.device | None = None, n_members: int = 1
+) -> None:
     """
     Write ``config.yml``: what is run, on which data, with which versions on what kind of machine.
 
     :param spec: what is run
     :param model: its model, with the data attached
     :param folder: where it is written
-    :param device: where it is trained, in words; ``None`` for the model's own
+    :param device: where it is trained; ``None`` for the model's own
+    :param n_members: of the population it is trained in
     """
     assert model.dataset is not None
     path, _ = find_file(model.dataset)
+    device = device or model.device
     hyperparameters = {name: _plain(value) for name, value in model.hyperparameters().items()}
     config = {
         "run": _config(spec),
@@ -423,7 +495,13 @@ def write_config(spec: RunSpec, model: OfflineAlgorithm, folder: Path, device: s
             "python": platform.python_version(),
             **{name: version(name) for name in ("torch", "stable-baselines3", "gymnasium", "mujoco", "numpy")},
         },
-        "machine": {"processor": platform.machine(), "device": device or str(model.device), "threads": th.get_num_threads()},
+        "machine": {
+            "processor": platform.machine(),
+            "device": str(device) if n_members == 1 else f"{device.type}, population of {n_members}",
+            # the one asked for is among the hyperparameters; a device that does not have it computes in float32
+            "precision": "float32" if missing_for(model.precision, device) else model.precision,
+            "threads": th.get_num_threads(),
+        },
     }
     write_text(folder / "config.yml", yaml.safe_dump(config, sort_keys=False))
 

@@ -224,6 +224,16 @@ def saved_algo(path: Path | io.BufferedIOBase) -> str | None:
     return algo if isinstance(algo, str) else None
 
 
+def saved_timesteps(path: Path) -> int:
+    """
+    :param path: zip file of a model
+    :return: gradient steps it had been trained for; nothing in it is unpickled
+    :raises CheckpointError: if it is no saved model
+    """
+    steps = _saved_data(path).get("num_timesteps")
+    return steps if isinstance(steps, int) else 0
+
+
 def _saved_data(path: Path | io.BufferedIOBase) -> dict[str, Any]:
     """The readable part of a saved model; what is pickled in it stays text."""
     position = path.tell() if isinstance(path, io.IOBase) else 0

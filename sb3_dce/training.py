@@ -22,10 +22,10 @@ from sb3_dce.envs import make_env, missing_simulator
 from sb3_dce.errors import CheckpointError, ConfigError
 from sb3_dce.evaluation import Evaluation, evaluate, read_evaluations
 from sb3_dce.files import quoted
-from sb3_dce.launch import launch
+from sb3_dce.launch import launch_all
 from sb3_dce.plots import plot_learning_curves
 from sb3_dce.rollouts import Rollouts, rollouts_of
-from sb3_dce.runs import RunSpec
+from sb3_dce.runs import RunSpec, check_before_running
 from sb3_dce.saving import existing_zip, saved_algo
 
 
@@ -55,6 +55,7 @@ def train_seeds(
     :param overrides: constructor arguments that replace those of the row
     :param console: where to print
     :return: results, one per seed
+    :raises SB3DCEError: the first error of a run, a divergence, too, after all others; those that are complete are shown
     """
     algo = hyperparams.full_name(algo)
     agent = agent_class(algo)
@@ -62,7 +63,7 @@ def train_seeds(
     path, spec = find_file(dataset)
     row = hyperparams.load_row(algo, None if spec is None else spec.id)
     total = n_updates or hyperparams.split_row(row).n_timesteps
-    if spec is not None and missing_simulator(spec) is None:
+    if rollouts_of(dataset, n_eval_episodes) is not None:
         check_ends_with_evaluation(total, eval_freq)
     name = short_name(dataset)
     folder = out or Path("runs") / f"{algo}-{name}"
@@ -72,17 +73,26 @@ def train_seeds(
         RunSpec(algo, dataset, seed, total, str(folder / f"seed_{seed}"), eval_freq, n_eval_episodes, overrides)
         for seed in seeds
     ]
-    results = launch(specs, workers, console)
+    check_before_running(specs)
+    outcomes = launch_all(specs, workers, console)
+    errors = [outcome for outcome in outcomes if isinstance(outcome, BaseException)]
+    results = [outcome for outcome in outcomes if not isinstance(outcome, BaseException)]
+    if not results:
+        raise errors[0]
     show_results({algo: results}, console)
     curves = {algo: [read_evaluations(Path(s.folder), None if spec is None else spec.id) for s in specs]}
     picture = plot_learning_curves(curves, folder / "learning_curve.png", title=name)
     drawn = f", {picture.name}" if picture else ""
-    evaluated = any(results) and results[0]["returns"] is not None
+    evaluated = results[0]["returns"] is not None
     files = "model.zip, config.yml" + (", evaluations.csv" if evaluated else "")
     console.print(f"saved  {folder}/seed_*/{files}{drawn}", markup=False, soft_wrap=True)
     needs = "" if evaluated else " --env <id of its environment>"
-    model = quoted(f"{specs[0].folder}/model.zip")
+    model = quoted(f"{folder}/seed_{results[0]['config']['seed']}/model.zip")
     console.print(f"next   sb3-dce evaluate {model}{needs}", markup=False, soft_wrap=True)
+    for error in errors[1:]:
+        console.print(f"failed: {error}", markup=False, soft_wrap=True)
+    if errors:
+        raise errors[0]
     return results
 
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
+from sb3_dce.configuration import differences
 from sb3_dce.experiments import results
-from sb3_dce.experiments.configuration import differences
 from sb3_dce.experiments.grid import Experiment, Scale, variant_hash
 
 SHA = "ab" * 32

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -194,33 +193,6 @@ def test_user_errors_are_one_clear_message(
     assert list(tmp_path.iterdir()) == []
     for word in words:
         assert word in message
-
-
-def children_of(pid: int) -> list[int]:
-    found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            parent, command = int(stat.read_text().rpartition(")")[2].split()[1]), (stat.parent / "cmdline").read_bytes()
-        except (OSError, IndexError):
-            continue
-        if parent == pid and b"spawn_main" in command:
-            found.append(int(stat.parent.name))
-    return found
-
-
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds the processes in /proc")
-def test_training_process_that_is_killed_is_one_clear_message(tmp_path: Path) -> None:
-    command = ["compare", "--dataset", TINY, "--algos", "bc", "--seeds", "1", "--updates", "1e6", "--eval-freq", "1000000"]
-    arguments = [sys.executable, "-c", "from sb3_dce.cli import main; main()", *command, *FAST, "--out", str(tmp_path)]
-    process = subprocess.Popen(arguments, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
-    deadline = time.monotonic() + 120
-    while not list(tmp_path.rglob("progress_0.csv")) and time.monotonic() < deadline and process.poll() is None:
-        time.sleep(0.1)
-    for pid in children_of(process.pid):
-        os.kill(pid, signal.SIGKILL)
-    _, message = process.communicate(timeout=60)
-    assert process.returncode == 2 and "Traceback" not in message
-    assert "ended from outside" in message and "fewer --workers" in message
 
 
 @pytest.mark.parametrize("command", [("reproduce", "config-tables"), ("compare", "--dataset", TINY, "--updates", "4")])

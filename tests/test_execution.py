@@ -17,7 +17,7 @@ from sb3_dce.capture import CapturedStep, CaptureError, StaticInputs
 from sb3_dce.errors import ConfigError, SB3DCEWarning
 from sb3_dce.execution import UPDATES_WORTH_A_COMPILED_CALLER, choose_execution
 from sb3_dce.metric_sums import MetricSums
-from sb3_dce.precision import RoundedLinear, _missing, _warn_once, matmul_precision
+from sb3_dce.precision import RoundedLinear, _warn_once, matmul_precision, missing_for
 
 CPU, CUDA = th.device("cpu"), th.device("cuda")
 
@@ -188,7 +188,7 @@ def test_precision_a_device_does_not_have_is_left_out_with_one_warning(transitio
 
 @pytest.mark.parametrize("rounds_itself", [True, False])
 def test_precision_is_put_back_even_after_an_error(rounds_itself: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sb3_dce.precision._missing", lambda precision, device: None)
+    monkeypatch.setattr("sb3_dce.precision.missing_for", lambda precision, device: None)
     monkeypatch.setattr("sb3_dce.precision._rounds_itself", lambda: rounds_itself)
     before = th.backends.mkldnn.matmul.fp32_precision
     with pytest.raises(RuntimeError, match="stop"), matmul_precision("bf16-matmul", CPU):
@@ -203,7 +203,7 @@ def test_precision_is_put_back_even_after_an_error(rounds_itself: bool, monkeypa
 
 def test_tf32_is_left_out_by_a_pytorch_without_its_switch(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(th.backends.cuda, "matmul", object())
-    assert _missing("tf32", CUDA) == "PyTorch 2.9 or later"
+    assert missing_for("tf32", CUDA) == "PyTorch 2.9 or later"
 
 
 def _wide_product_error(width: int = 64) -> float:
@@ -238,7 +238,7 @@ def test_narrow_and_float64_layers_are_not_rounded() -> None:
 @needs_compiler
 @pytest.mark.slow
 def test_rounding_holds_in_compiled_updates(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sb3_dce.precision._missing", lambda precision, device: None)
+    monkeypatch.setattr("sb3_dce.precision.missing_for", lambda precision, device: None)
     monkeypatch.setattr("sb3_dce.precision._rounds_itself", lambda: False)
     kwargs = {"dataset": transitions, "batch_size": 64, "policy_kwargs": {"net_arch": [64, 64]}, "seed": 0}
     settings = {"plain": ("eager", "float32"), "eager": ("eager", "bf16-matmul"), "compiled": ("compile", "bf16-matmul")}
@@ -293,7 +293,7 @@ def test_updates_of_a_very_long_run_are_called_from_compiled_code_and_equal_eage
     assert largest_difference(*map(all_tensors, models)) < 1e-10
 
 
-@pytest.mark.skipif(_missing("bf16-matmul", CPU) is not None, reason="needs a processor with bf16 products")
+@pytest.mark.skipif(missing_for("bf16-matmul", CPU) is not None, reason="needs a processor with bf16 products")
 def test_bf16_products_change_the_numbers_a_little(transitions: Transitions) -> None:
     kwargs = {"dataset": transitions, "batch_size": 64, "policy_kwargs": {"net_arch": [64, 64]}, "seed": 0}
     plain, rounded = (OfflineDCE("MlpPolicy", precision=p, **kwargs).learn(5) for p in ("float32", "bf16-matmul"))

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from commands import sb3_dce
 
+from sb3_dce.configuration import config_hash, differences
 from sb3_dce.data.locate import DATASETS_VARIABLE
 from sb3_dce.errors import ConfigError, DatasetNotFoundError
-from sb3_dce.experiments.configuration import config_hash, differences
 from sb3_dce.experiments.grid import (
     EMBEDDED,
     SCALES,

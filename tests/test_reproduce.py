@@ -51,7 +51,10 @@ def small_plan(name: str, folder: Path, updates: int = 40, seeds: int = 1) -> li
 
 def train(planned: list[PlannedRun], done: set[tuple[object, ...]] = frozenset(), **settings: object) -> list[str]:  # type: ignore[assignment]
     arguments = {"workers": 2, "device": "cpu", "ray_address": None, "console": QUIET, **settings}
-    return execute(planned, done, **arguments)  # type: ignore[arg-type]
+    diverged, errors = execute(planned, done, **arguments)  # type: ignore[arg-type]
+    if errors:
+        raise errors[0]
+    return diverged
 
 
 def models(folder: Path) -> dict[str, int]:

@@ -21,10 +21,10 @@ import yaml
 
 from sb3_dce import hyperparams
 from sb3_dce.agents import agent_class
+from sb3_dce.configuration import config_hash, defaults_of, differences, row_of
 from sb3_dce.data.catalog import resolve
 from sb3_dce.data.locate import known_dataset, search
 from sb3_dce.errors import ConfigError, DatasetNotFoundError
-from sb3_dce.experiments.configuration import config_hash, defaults_of, differences, row_of
 from sb3_dce.runs import RunSpec
 
 SCALES = ("smoke", "cpu", "full")

@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sb3_dce.configuration import row_of
 from sb3_dce.dce import OfflineDCE
 from sb3_dce.experiments import diagnosis, tables
-from sb3_dce.experiments.configuration import row_of
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.figures import panel_curves, variants_of
 from sb3_dce.experiments.grid import Variant, source_of

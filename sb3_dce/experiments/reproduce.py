@@ -12,6 +12,7 @@ from typing import Any
 import pandas as pd
 from rich.console import Console
 from rich.table import Table
+from stable_baselines3.common.utils import get_device
 
 from sb3_dce.checks import check_choice, check_ends_with_evaluation
 from sb3_dce.data.catalog import resolve
@@ -38,8 +39,8 @@ from sb3_dce.experiments.run import execute, is_complete
 from sb3_dce.experiments.tables import parts_of
 from sb3_dce.files import check_writable
 from sb3_dce.hyperparams import did_you_mean, full_name
-from sb3_dce.precision import PRECISIONS
-from sb3_dce.runs import RunSpec, refuse_other_run
+from sb3_dce.precision import PRECISIONS, missing_for
+from sb3_dce.runs import RunSpec, read_config, refuse_other_run
 from sb3_dce.sb3_checks import check_device
 
 DEVICES = ("auto", "cpu", "cuda")
@@ -117,37 +118,19 @@ def reproduce(request: Request, console: Console) -> dict[str, Report]:
     :param request: what is wanted
     :param console: where to print
     :return: reports by experiment
-    :raises SB3DCEError: if data are missing, or a run fails for another reason than divergence
+    :raises SB3DCEError: if data are missing, or, after all others and the report, the first error of a run that is no
+        divergence
     """
-    if request.scale not in SCALES:
-        hint = f"{did_you_mean(request.scale, SCALES)}There are {', '.join(SCALES)}."
-        raise ConfigError(f"no scale {request.scale!r}", key="--scale", hint=hint)
-    check_choice("--device", request.device, DEVICES)
-    check_choice("--precision", request.precision, PRECISIONS)
-    check_device(request.device)
-    if request.report_only and (request.datasets or request.agents or request.seeds or request.first_seed):
-        hint = "It reports all rows: leave out --datasets, --agents, --seeds and --first-seed."
-        raise ConfigError("--report-only trains nothing", key="--report-only", hint=hint)
+    _check_request(request)
     experiments = [load_experiment(name) for name in request.ids]
     scales = {e.id: scale_of(e, request) for e in experiments}
-    for folder in (*request.reuse, *request.imports):
-        if not folder.is_dir():
-            raise ConfigError("no such folder", where=str(folder), key="--reuse/--import", hint="Check the path.")
-    for folder in request.reuse:
-        if not results.has_rows(folder):
-            hint = "Name a folder with .csv.gz files, or one that reproduce wrote; runs are taken with --import."
-            raise ConfigError("no result rows in the folder", where=str(folder), key="--reuse", hint=hint)
-    for folder in request.imports:
-        if next(folder.rglob("config.yml"), None) is None:
-            raise ConfigError("no runs below the folder", where=str(folder), key="--import", hint="Name one that train wrote.")
-    if request.page is not None:
-        check_writable(request.page)
     if not request.report_only:
         request.out.mkdir(parents=True, exist_ok=True)
         # two calls with one folder take turns: they may have runs in common
         with exclusive(request.out / ".lock", limit=WAIT, note=lambda text: console.print(text, markup=False)):
-            rows = _train(request, experiments, scales, console)
+            rows, errors = _train(request, experiments, scales, console)
     else:
+        errors = []
         rows = results.merge([_known(request), *(results.import_runs(f, request.ids[0]) for f in request.imports)])
         _keep_rows(rows, request, results.empty())
         # runs of an unfinished call with this folder are shown, and left for it to keep
@@ -162,7 +145,40 @@ def reproduce(request: Request, console: Console) -> dict[str, Report]:
     if request.page is not None:
         write_page(request.page, request.out, evidences, reports, _command(request))
         console.print(f"page   {request.page}", markup=False)
+    for error in errors[1:]:
+        console.print(f"failed: {error}", markup=False, soft_wrap=True)
+    if errors:  # what is complete has been kept and shown
+        raise errors[0]
     return reports
+
+
+def _check_request(request: Request) -> None:
+    """What is wrong with it is said before anything is trained."""
+    if request.scale not in SCALES:
+        hint = f"{did_you_mean(request.scale, SCALES)}There are {', '.join(SCALES)}."
+        raise ConfigError(f"no scale {request.scale!r}", key="--scale", hint=hint)
+    check_choice("--device", request.device, DEVICES)
+    check_choice("--precision", request.precision, PRECISIONS)
+    check_device(request.device)
+    lacking = missing_for(request.precision, get_device(request.device))
+    if lacking is not None and request.ray_address is None:
+        hint = "Leave it out: float32 runs everywhere."
+        raise ConfigError(f"--precision {request.precision} needs {lacking}", key="--precision", hint=hint)
+    if request.report_only and (request.datasets or request.agents or request.seeds or request.first_seed):
+        hint = "It reports all rows: leave out --datasets, --agents, --seeds and --first-seed."
+        raise ConfigError("--report-only trains nothing", key="--report-only", hint=hint)
+    for folder in (*request.reuse, *request.imports):
+        if not folder.is_dir():
+            raise ConfigError("no such folder", where=str(folder), key="--reuse/--import", hint="Check the path.")
+    for folder in request.reuse:
+        if not results.has_rows(folder):
+            hint = "Name a folder with .csv.gz files, or one that reproduce wrote; runs are taken with --import."
+            raise ConfigError("no result rows in the folder", where=str(folder), key="--reuse", hint=hint)
+    for folder in request.imports:
+        if next(folder.rglob("config.yml"), None) is None:
+            raise ConfigError("no runs below the folder", where=str(folder), key="--import", hint="Name one that train wrote.")
+    if request.page is not None:
+        check_writable(request.page)
 
 
 def hash_here(dataset_id: str) -> str | None:
@@ -178,22 +194,24 @@ def _known(request: Request) -> pd.DataFrame:
     return results.merge([results.read_folder(request.out / "rows"), *map(results.read_folder, request.reuse)])
 
 
-def _train(request: Request, experiments: list[Experiment], scales: dict[str, Scale], console: Console) -> pd.DataFrame:
-    """Run what is missing and keep its rows; all rows there are then."""
+def _train(
+    request: Request, experiments: list[Experiment], scales: dict[str, Scale], console: Console
+) -> tuple[pd.DataFrame, list[BaseException]]:
+    """Run what is missing and keep its rows; all rows there are then, and errors of runs."""
     planned = [run for e in experiments for run in plan_runs(e, scales[e.id], request)]
     imported = results.merge(results.import_runs(folder, request.ids[0]) for folder in request.imports)
     known = results.merge([_known(request), imported])
     done = results.done_runs(known, planned)
     for run in {run.spec.folder: run for run in planned}.values():
-        refuse_other_run(run.spec, Path(run.spec.folder))
+        refuse_other_run(_with_its_precision(run.spec), Path(run.spec.folder))
     _say_plan(planned, done, scales, request.precision, console)
-    diverged = execute(planned, done, request.workers, request.device, request.ray_address, console)
+    diverged, errors = execute(planned, done, request.workers, request.device, request.ray_address, console)
     for text in diverged:
         console.print(f"diverged: {text}", markup=False)
     fresh = results.planned_rows(planned)  # first, since a run that is known by fewer episodes has been trained again
     rows = results.merge([fresh, known])
     _keep_rows(rows, request, fresh)
-    return rows
+    return rows, errors
 
 
 def show_list(console: Console) -> None:
@@ -266,6 +284,16 @@ def plan_runs(experiment: Experiment, scale: Scale, request: Request) -> list[Pl
 
 def _with_precision(spec: RunSpec, precision: str) -> RunSpec:
     return replace(spec, overrides={**spec.overrides, "precision": precision})
+
+
+def _with_its_precision(spec: RunSpec) -> RunSpec:
+    """A complete run counts whatever its precision was: rows say it, and it makes no other run."""
+    config = read_config(Path(spec.folder)) if is_complete(spec) else None
+    if config is None:
+        return spec
+    overrides = {name: value for name, value in spec.overrides.items() if name != "precision"}
+    begun = config["run"].get("overrides", {})
+    return replace(spec, overrides={**overrides, **({"precision": begun["precision"]} if "precision" in begun else {})})
 
 
 def _say_plan(

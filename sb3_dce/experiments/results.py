@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from sb3_dce.configuration import config_hash, differences
 from sb3_dce.data import find_file
 from sb3_dce.data.catalog import resolve
 from sb3_dce.data.hashes import sha256_once
 from sb3_dce.data.locate import catalogue_id, short_name
 from sb3_dce.errors import CheckpointError, SB3DCEError
 from sb3_dce.evaluation import read_evaluations
-from sb3_dce.experiments.configuration import config_hash, differences
 from sb3_dce.experiments.grid import PlannedRun
 from sb3_dce.files import write_atomically
 from sb3_dce.runs import read_config, read_divergence, read_result
@@ -262,7 +262,8 @@ def check_rows(rows: pd.DataFrame, where: str) -> None:
 
 
 def _device(config: dict[str, Any]) -> str:
-    precision = config["hyperparameters"].get("precision", "float32")
+    # files of earlier versions say only which was asked for
+    precision = config["machine"].get("precision") or config["hyperparameters"].get("precision", "float32")
     return f"{config['machine']['device']}{'' if precision == 'float32' else ' ' + precision}"
 
 

@@ -15,9 +15,9 @@ from rich.console import Console
 from stable_baselines3.common.utils import get_device
 
 from sb3_dce.agents import agent_class
+from sb3_dce.configuration import row_of
 from sb3_dce.data.catalog import resolve
 from sb3_dce.errors import DivergenceError
-from sb3_dce.experiments.configuration import row_of
 from sb3_dce.experiments.grid import PlannedRun
 from sb3_dce.experiments.probe import prepare_probe
 from sb3_dce.launch import launch_all
@@ -38,7 +38,7 @@ def execute(
     device: th.device | str,
     ray_address: str | None,
     console: Console,
-) -> list[str]:
+) -> tuple[list[str], list[BaseException]]:
     """
     Train what is not complete, each run once, those first that others need.
 
@@ -48,8 +48,7 @@ def execute(
     :param device: "cpu", "cuda" or "auto"; on "cuda" runs that differ in data, seed or numbers are one batched computation
     :param ray_address: of a Ray cluster that trains instead of this machine
     :param console: where progress is shown
-    :return: for each run that diverged, what happened
-    :raises SB3DCEError: the first other error, after all others have been run
+    :return: for each run that diverged, what happened; other errors
     """
     wanted = {run.spec.folder: run for run in planned if run.key not in done and not is_complete(run.spec)}
     needed = {run.needs for run in wanted.values() if run.needs is not None}
@@ -64,15 +63,14 @@ def execute(
     failures += [
         DivergenceError(f"the probe needs the last policy of {path.name}, which diverged", hint=hint) for path in without
     ]
-    after = [(spec, best_policy) for spec, best_policy in after if best_policy not in without]
+    # where the run that is needed has failed otherwise, its own error says why
+    after = [(spec, path) for spec, path in after if path not in without and (not failures or read_result(path) is not None)]
     for spec, best_policy in after:
         prepare_probe(spec, best_policy)
     # A probe begins from a file on this machine, and is one model with five sets of critics: never batched.
     failures += _run_all([spec for spec, _ in after], workers, th.device("cpu"), None, console)
-    other = [error for error in failures if not isinstance(error, DivergenceError)]
-    if other:
-        raise other[0]
-    return [str(error) for error in failures]
+    diverged = [str(error) for error in failures if isinstance(error, DivergenceError)]
+    return diverged, [error for error in failures if not isinstance(error, DivergenceError)]
 
 
 def is_complete(spec: RunSpec) -> bool:

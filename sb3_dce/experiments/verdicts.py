@@ -12,8 +12,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from sb3_dce.configuration import row_of
 from sb3_dce.dce_probe import PROBE_BETAS
-from sb3_dce.experiments.configuration import row_of
 from sb3_dce.experiments.evidence import GAMMA, TAU, Evidence
 from sb3_dce.experiments.figures import probe_difference
 from sb3_dce.experiments.grid import Variant, source_of

@@ -1,0 +1,162 @@
+"""Runs that are interrupted, killed, diverge or are asked for otherwise than before: nothing is lost, nothing is mixed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from commands import sb3_dce
+from update_tools import all_tensors, largest_difference
+
+from sb3_dce import OfflineDCE, runs
+from sb3_dce.errors import ConfigError
+from sb3_dce.experiments import results
+from sb3_dce.launch import SAVING_SECONDS
+from sb3_dce.runs import RunSpec, StoppedError, check_before_running, read_result, run
+from sb3_dce.saving import saved_timesteps
+
+TINY = "halfcheetah-tiny-sb3"
+SMALL: dict[str, Any] = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 16, "execution": "eager"}
+FAST = [text for key, value in SMALL.items() for text in ("--set", f"{key}={json.dumps(value)}")]
+
+
+def spec(folder: Path, n_updates: int, **overrides: Any) -> RunSpec:
+    return RunSpec("dce", TINY, 0, n_updates, str(folder), 10, 1, {**SMALL, **overrides})
+
+
+def after(n_updates: int) -> Callable[[], bool]:
+    """Tells a run to end after so many updates."""
+    asked = iter(range(1, n_updates))
+    return lambda: next(asked, None) is None
+
+
+def test_run_that_is_told_to_end_saves_and_goes_on_to_the_same_end(tmp_path: Path) -> None:
+    for steps in (13, 4):  # 13 updates, then 4 more
+        with pytest.raises(StoppedError):
+            run(spec(tmp_path / "parts", 30), stop=after(steps))
+    assert saved_timesteps(tmp_path / "parts" / "checkpoint.zip") == 17
+    parts, whole = run(spec(tmp_path / "parts", 30)), run(spec(tmp_path / "whole", 30))
+    assert parts["returns"] == whole["returns"]
+    models = [OfflineDCE.load(tmp_path / name / "model.zip") for name in ("parts", "whole")]
+    assert largest_difference(*map(all_tensors, models)) == 0
+    steps = [list(results.read_log(tmp_path / name).index) for name in ("parts", "whole")]
+    assert steps[0] == steps[1] == [10, 20, 30]
+
+
+def test_interrupted_run_is_not_made_shorter_than_it_is(tmp_path: Path) -> None:
+    with pytest.raises(StoppedError):
+        run(spec(tmp_path, 100), stop=after(25))
+    with pytest.raises(ConfigError, match="n_updates=100 there, 20 now"):
+        run(spec(tmp_path, 20))
+    assert run(spec(tmp_path, 30))["n_updates"] == 30
+
+
+def test_changed_row_of_the_hyperparameter_file_makes_another_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(spec(tmp_path, 10))
+    row = runs.row_of("dce", TINY)
+    monkeypatch.setattr(runs, "row_of", lambda algo, dataset_id: {**row, "beta": 3.0})
+    with pytest.raises(ConfigError, match=r"beta=4\.0 there, 3\.0 now, by the hyperparameter file"):
+        run(spec(tmp_path, 20))
+    run(spec(tmp_path / "other", 10))
+    assert OfflineDCE.load(tmp_path / "other" / "model.zip").beta == 4.0, "the test changes what is compared, not the row"
+
+
+def test_logs_of_work_that_is_done_again_are_forgotten(tmp_path: Path) -> None:
+    for steps in (12, 13):
+        with pytest.raises(StoppedError):
+            run(spec(tmp_path, 40), stop=after(steps))
+    assert {path.name for path in tmp_path.glob("progress_*.csv")} == {"progress_0.csv", "progress_12.csv"}
+    (tmp_path / "checkpoint.zip").unlink()  # as the message on a damaged one says
+    run(spec(tmp_path, 40))
+    assert [path.name for path in tmp_path.glob("progress_*.csv")] == ["progress_0.csv"]
+    assert list(results.read_log(tmp_path).index) == [10, 20, 30, 40]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"gradient_steps": 7}, "eval_freq=10 is no multiple of gradient_steps=7"),
+        ({"policy_kwargs": {"optimizer_kwargs": {"foo": 1}}}, "cannot be made with its settings: TypeError.*foo"),
+    ],
+)
+def test_settings_that_no_training_can_have_leave_nothing(overrides: dict[str, Any], message: str, tmp_path: Path) -> None:
+    wrong = replace(spec(tmp_path / "run", 20), overrides={**SMALL, **overrides})
+    with pytest.raises(ConfigError, match=message):
+        check_before_running([wrong])
+    command = ["compare", "--dataset", TINY, "--algos", "dce", "--updates", "20", "--eval-freq", "10", "--seeds", "1"]
+    settings = [text for key, value in wrong.overrides.items() for text in ("--set", f"{key}={json.dumps(value)}")]
+    outcome = sb3_dce(*command, *settings, "--out", str(tmp_path / "out"))
+    assert outcome.code == 2 and "Traceback" not in outcome.stderr and not (tmp_path / "out").exists()
+
+
+def test_seed_that_diverges_ends_no_other(tmp_path: Path) -> None:
+    command = ["train", TINY, "--updates", "20", "--eval-freq", "10", "--eval-episodes", "1", "--workers", "1", *FAST]
+    (tmp_path / "seed_0").mkdir(parents=True)
+    runs.write_divergence(tmp_path / "seed_0", 7, "metrics not finite: train/q_data")
+    outcome = sb3_dce(*command, "--seeds", "2", "--out", str(tmp_path))
+    assert outcome.code == 2 and "metrics not finite" in outcome.stderr and "Traceback" not in outcome.stderr
+    assert read_result(tmp_path / "seed_1") is not None and "seed_1/model.zip" in outcome.stdout
+
+
+def begin(command: list[str], folder: Path, ready: str) -> subprocess.Popen[str]:
+    """A command in a process of its own, once files of this pattern are in the folder."""
+    arguments = [sys.executable, "-c", "from sb3_dce.cli import main; main()", *command, *FAST, "--out", str(folder)]
+    process = subprocess.Popen(arguments, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 200
+    while not list(folder.rglob(ready)) and time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.02)
+    return process
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no such signals")
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_command_saves_where_it_is_and_goes_on(sent: signal.Signals, tmp_path: Path) -> None:
+    command = ["train", TINY, "--updates", "1000000", "--eval-freq", "200000", "--eval-episodes", "1"]
+    process = begin(command, tmp_path, "progress_0.csv")
+    time.sleep(1)
+    process.send_signal(sent)
+    stdout, stderr = process.communicate(timeout=SAVING_SECONDS)
+    assert process.returncode == 130 and stderr == ""
+    assert "saving what is being trained" in stdout and "The same command goes on from there." in stdout
+    done = saved_timesteps(tmp_path / "seed_0" / "checkpoint.zip")
+    assert 0 < done < 1_000_000 and done % 200_000
+    config = yaml.safe_load((tmp_path / "seed_0" / "config.yml").read_text())
+    again = RunSpec(**{**config["run"], "n_updates": 200_000}, folder=str(tmp_path / "seed_0"))
+    with pytest.raises(StoppedError):
+        run(again, stop=after(2))
+    assert saved_timesteps(tmp_path / "seed_0" / "checkpoint.zip") == done + 2
+
+
+def children_of(pid: int) -> list[int]:
+    """Training processes of a command, the oldest first."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parent, command = int(stat.read_text().rpartition(")")[2].split()[1]), (stat.parent / "cmdline").read_bytes()
+        except (OSError, IndexError):
+            continue
+        if parent == pid and b"spawn_main" in command:
+            found.append(int(stat.parent.name))
+    return sorted(found)
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds the processes in /proc")
+def test_process_that_is_killed_takes_no_other_run_with_it(tmp_path: Path) -> None:
+    lengths = ["--updates", "20", "--updates-of", "dce=1e6", "--eval-freq", "20", "--eval-episodes", "1", "--workers", "1"]
+    process = begin(["compare", "--dataset", TINY, "--algos", "dce,bc", "--seeds", "1", *lengths], tmp_path, "checkpoint.zip")
+    os.kill(children_of(process.pid)[0], signal.SIGKILL)
+    stdout, stderr = process.communicate(timeout=120)
+    assert process.returncode == 2 and "Traceback" not in stderr
+    assert "the process of dce seed 0 was ended from outside" in stderr and "fewer --workers" in stderr
+    assert "offline_bc" in stdout and (tmp_path / "comparison.md").is_file()
+    assert read_result(tmp_path / "offline_bc" / "seed_0") is not None
