@@ -40,8 +40,8 @@ class OfflineBC(OfflineAlgorithm):
 
     Parameters not listed here are described in :class:`~sb3_dce.base.OfflineAlgorithm`.
 
-    :param bc_loss: ``"mse"`` trains the deterministic action (default), ``"nll"`` the whole distribution; its
-        log-probabilities need actions inside (-1, 1), so data are clipped to +-(1 - 1e-5) there
+    :param bc_loss: ``"mse"`` trains the deterministic action (default), which ``predict`` then always gives; ``"nll"`` trains
+        the whole distribution. Its log-probabilities need actions inside (-1, 1), so data are clipped to +-(1 - 1e-5) there
     :param fraction: clone only this share of the whole episodes, the best by undiscounted return (0.1 is "10 % BC"); 1.0 uses
         all rows. The chosen rows are copied
     """
@@ -104,6 +104,9 @@ class OfflineBC(OfflineAlgorithm):
         super().check_parameters()
         check_choice("bc_loss", self.bc_loss, ("mse", "nll"))
         check_number("fraction", self.fraction, 0, 1, open_low=True, hint="0.1 clones the best tenth of the episodes.")
+
+    def policy_settings(self) -> dict[str, Any]:
+        return {**super().policy_settings(), "stochastic": self.bc_loss == "nll"}
 
     def chosen_rows(self, transitions: Transitions) -> np.ndarray | None:
         return rows_of_best_episodes(transitions, self.fraction) if self.fraction < 1.0 else None

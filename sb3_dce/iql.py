@@ -37,7 +37,8 @@ class IQLOptions(UpdateOptions):
 
 class OfflineIQL(OfflineAlgorithm):
     """
-    Implicit Q-learning (Kostrikov, Nair & Levine, 2021), with the settings of the authors' code for the gym sets.
+    Implicit Q-learning (Kostrikov, Nair & Levine, 2021). Defaults are the authors' for the gym sets but for the scale of the
+    rewards, ``reward_normalization="iql"``, which needs whole episodes; ``load_dataset`` takes all of them from the set's row.
 
     No value of an action outside of the data is ever asked for. V(s) is an expectile of Q over the actions of the data,
     Q is trained on V, and the policy clones actions with the weight ``min(exp(temperature * (Q - V)), max_weight)``.

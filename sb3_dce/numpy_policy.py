@@ -341,17 +341,19 @@ def actor_parts(policy: Any) -> tuple[list[Any], Layer | np.ndarray | None, Any,
     from sb3_dce.actors import LOG_STD_MAX as IQL_LOG_STD_MAX
     from sb3_dce.actors import LOG_STD_MIN as IQL_LOG_STD_MIN
     from sb3_dce.actors import DeterministicActor, GaussianActor
-    from sb3_dce.policies import OfflineTD3Policy
+    from sb3_dce.policies import ActorPolicy, OfflineTD3Policy
 
     for space in (policy.observation_space, policy.action_space):
         if not isinstance(space, spaces.Box) or len(space.shape) != 1:
             return None
-    known = (SACPolicy._predict, TD3Policy._predict, OfflineTD3Policy._predict, ActorCriticPolicy._predict, *_contrib())
+    own = (ActorPolicy._predict, OfflineTD3Policy._predict)
+    known = (SACPolicy._predict, TD3Policy._predict, ActorCriticPolicy._predict, *own, *_contrib())
     if type(policy).predict is not BasePolicy.predict or type(policy)._predict not in known:
         return None
     actor: Any = getattr(policy, "actor", None)
     if type(actor) in _squashed_gaussian_actors() and not actor.use_sde:
-        return [*actor.latent_pi, actor.mu], _layer(actor.log_std), actor.features_extractor, "draw"
+        spread = _layer(actor.log_std) if getattr(policy, "stochastic", True) else None
+        return [*actor.latent_pi, actor.mu], spread, actor.features_extractor, "draw"
     if type(actor) in (TD3Actor, DeterministicActor) and _is_tanh(actor.mu[-1]):
         return list(actor.mu)[:-1], None, actor.features_extractor, "draw"
     if type(actor) is GaussianActor:

@@ -62,7 +62,7 @@ class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OODWeight, OfflineAlgor
     :param ood_weight_steps: gradient steps
     :param ood_weight_next: w_n, weight of u in the pseudo-targets at s'
     :param adaptive_ood_weight: after ``ood_weight_steps`` updates divide w_s by ``ood_weight_decay`` once per epoch while
-        Q(s, a ~ pi) falls: mean of the last 5 recorded values below that of the 15 before. One value is recorded per
+        Q(s, a ~ pi) falls: mean of the last 5 recorded values below that of the (up to) 15 before. One value is recorded per
         epoch, at its first update, and takes part in the comparison from the next epoch on
     :param ood_weight_decay: divisor, above 1
     :param ood_weight_min: the adaptive rule stops once w_s is not above this value

@@ -152,7 +152,21 @@ class OfflineSACPolicy(SACPolicy):
 
 
 class ActorPolicy(OfflineSACPolicy):
-    """The same policy with an actor only, for agents without critics; parameters as :class:`OfflineSACPolicy`."""
+    """
+    The same policy with an actor only, for agents without critics; further parameters as :class:`OfflineSACPolicy`.
+
+    :param stochastic: whether ``predict`` draws actions unless it is told not to; False where only the mean is trained
+    """
+
+    def __init__(self, *args: Any, stochastic: bool = True, **kwargs: Any) -> None:
+        self.stochastic = stochastic
+        super().__init__(*args, **kwargs)
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self.actor(observation, deterministic or not self.stochastic)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {**super()._get_constructor_parameters(), "stochastic": self.stochastic}
 
     def _build(self, lr_schedule: Schedule) -> None:
         self.actor = self.make_actor()

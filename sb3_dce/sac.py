@@ -123,7 +123,8 @@ def update(
     coef: dict[str, th.Tensor],
 ) -> tuple[dict[str, Any], dict[str, th.Tensor]]:
     """
-    One gradient step of SAC, in the order of Stable-Baselines3: temperature, critics, actor, targets.
+    One gradient step of SAC, equal to that of Stable-Baselines3: target, critics, actor, temperature (used before its step, so
+    that this may come last), moving average.
 
     :param options: choices fixed at trace time
     :param nets: networks as functions of their flat parameters

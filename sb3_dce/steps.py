@@ -143,7 +143,9 @@ def q_data_metrics(q_values: th.Tensor) -> dict[str, th.Tensor]:
     :return: the diagnostics every agent with critics logs of them
     """
     names = ("q_data", "q_data_std", "q_data_min", "q_data_max")
-    return dict(zip(names, (q_values.mean(), q_values.std(), q_values.min(), q_values.max()), strict=True))
+    # a single value has no sample deviation, and a NaN would be taken for a divergence
+    spread = q_values.std(correction=min(1, q_values.numel() - 1))
+    return dict(zip(names, (q_values.mean(), spread, q_values.min(), q_values.max()), strict=True))
 
 
 def action_metrics(actions: th.Tensor, data_actions: th.Tensor) -> dict[str, th.Tensor]:

@@ -302,8 +302,16 @@ def most_dropped(width: int, dropout: float) -> int:
     :param dropout: probability that a unit is dropped
     :return: smallest number that a mask exceeds with a probability below :data:`RARE`, at least 1
     """
-    chances = [math.comb(width, k) * dropout**k * (1.0 - dropout) ** (width - k) for k in range(width + 1)]
-    return next(k for k in range(1, width + 1) if sum(chances[k + 1 :]) < RARE)
+    if dropout == 0.0:
+        return 1
+    more = 0.0  # probability of more than k
+    for k in range(width, 1, -1):
+        # in logarithms: the number of masks of a wide layer is beyond what a float holds
+        ways = math.lgamma(width + 1) - math.lgamma(k + 1) - math.lgamma(width - k + 1)
+        more += math.exp(ways + k * math.log(dropout) + (width - k) * math.log1p(-dropout))
+        if more >= RARE:
+            return k
+    return 1
 
 
 class ActionVAE(KeepDtype, BaseModel):

@@ -92,8 +92,10 @@ def test_every_algorithm_has_the_rows_of_the_paper() -> None:
     rows = {algo: set(hyperparams.read_rows(algo)) for algo in AGENTS}
     paper = {row["dataset"] for row in PAPER} | {"default"}
     assert len(PAPER) == 23 and rows["dce"] == paper
-    # PBRL has the expert sets of its authors, too, and CQL AntMaze
-    assert {algo for algo in rows if rows[algo] != paper} == {"offline_pbrl", "offline_cql"}
+    # PBRL has the expert sets of its authors, too, and CQL and IQL AntMaze
+    assert {algo for algo in rows if rows[algo] != paper} == {"offline_pbrl", "offline_cql", "offline_iql"}
+    antmaze = {spec.id for spec in catalog.all_specs() if spec.family == "antmaze"}
+    assert rows["offline_cql"] - paper == rows["offline_iql"] - paper == antmaze
     assert all(paper <= names for names in rows.values())
 
 

@@ -257,6 +257,7 @@ class PlainDCE:
 
 CASES: dict[str, dict[str, Any]] = {
     "default": {},
+    "sac_with_v": {"beta": 0.0},
     "ent_coef_fixed": {"ent_coef": 0.5},
     "ent_coef_starts_low": {"ent_coef": "auto_0.1", "target_entropy": -1.5},
     "without_v": {"use_v": False, "td_loss_coef": 0.5},

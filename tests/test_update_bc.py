@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,8 @@ from update_tools import (
     to_float64,
 )
 
-from sb3_dce import OfflineBC, Transitions, losses
+from sb3_dce import OfflineBC, OfflineSAC, Transitions, losses
+from sb3_dce.numpy_policy import numpy_policy
 
 BATCH = 8
 
@@ -111,3 +113,26 @@ def test_likelihood_is_finite_at_the_bounds_of_the_actions() -> None:
     at_bounds = losses.bc_nll(zero, zero, th.tensor([[1.0], [-1.0]], dtype=th.float64))
     just_inside = losses.bc_nll(zero, zero, th.tensor([[1 - 1e-5], [1e-5 - 1]], dtype=th.float64))
     assert np.isfinite(float(at_bounds)) and float(at_bounds) == pytest.approx(float(just_inside), rel=1e-12)
+
+
+# -- prediction --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("bc_loss", "drawn"), [("mse", False), ("nll", True)])
+def test_actions_are_drawn_only_where_their_spread_is_trained(
+    bc_loss: str, drawn: bool, transitions: Transitions, tmp_path: Path
+) -> None:
+    OfflineBC("MlpPolicy", dataset=transitions, bc_loss=bc_loss, seed=0).save(tmp_path / "model")
+    model = OfflineBC.load(tmp_path / "model")
+    obs = transitions.observations[:20]
+    mean = model.predict(obs, deterministic=True)[0]
+    assert np.array_equal(model.predict(obs)[0], mean) != drawn
+    assert np.array_equal(model.policy.predict(obs)[0], mean) != drawn
+    recorded = numpy_policy(model.policy)
+    assert recorded is not None and recorded.is_stochastic == drawn
+
+
+@pytest.mark.parametrize("n_critics", [1, 2])
+def test_batch_of_one_row_is_no_divergence(n_critics: int, transitions: Transitions) -> None:
+    kwargs = {"policy_kwargs": {"net_arch": [8], "n_critics": n_critics}, "batch_size": 1, "seed": 0}
+    assert OfflineSAC("MlpPolicy", dataset=transitions, **kwargs).learn(3).num_timesteps == 3

@@ -325,6 +325,7 @@ def test_defaults_are_the_authors(transitions: Transitions) -> None:
     assert rates == {"learning_rate": 3e-4, "actor_learning_rate": 1e-4, "log_ent_coef_learning_rate": 1e-4}
     assert model.noise_specs(256)["uniform"].shape == (10, 256, 2)
     assert [model.update_variant(n)["clone"] for n in (0, 39_999, 40_000)] == [True, True, False]
+    assert model.actor_q_timing == "previous" and model.lagrange_form == "weighted_gap"
 
 
 @pytest.mark.parametrize(

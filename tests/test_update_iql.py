@@ -350,6 +350,13 @@ def test_rewards_of_the_gym_rows_are_divided_by_the_range_of_returns() -> None:
     assert model.coefficients(0)["reward_scale"] == 0.25
 
 
+def test_defaults_are_the_authors_on_gym_sets_but_for_the_scale_of_rewards(transitions: Transitions) -> None:
+    model = OfflineIQL("MlpPolicy", dataset=transitions)
+    assert (model.expectile, model.temperature, model.max_weight, model.actor_dropout) == (0.7, 3.0, 100.0, 0.0)
+    assert model.policy.critic_arch == [256, 256] and model.actor_lr_schedule == "cosine"
+    assert model.reward_normalization is None, "it needs whole episodes; the rows of the gym sets have it"
+
+
 @pytest.mark.parametrize(
     ("dataset", "expected"),
     [

@@ -11,6 +11,7 @@ import copy
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch as th
 from torch import nn
@@ -185,6 +186,10 @@ CASES: dict[str, dict[str, Any]] = {
     "falling_weight": {"ood_weight": 5.0, "ood_weight_final": 1.0, "ood_weight_steps": 4},
     "prior": {"prior_scale": 0.7},
     "adaptive": {"adaptive_ood_weight": True},
+    "adaptive_divides": {
+        **{"adaptive_ood_weight": True, "ood_weight_steps": 2, "steps_per_epoch": 1, "ood_weight_decay": 1.5},
+        "reward_shift": -5.0,
+    },
     "max_grad_norm": {"max_grad_norm": 0.1},
     "discount": {"gamma": 0.5, "tau": 0.3, "reward_scale": 0.5, "reward_shift": -0.25},
 }
@@ -200,9 +205,16 @@ def test_update_equals_the_plain_restatement(case: str, transitions: Transitions
     model = make_model(transitions, **CASES[case])
     plain, start = PlainPBRL(model), copy.deepcopy(model.policy.state_dict())
     recorded = record_steps(monkeypatch)
-    model.train(10, BATCH)
+    model.train(20, BATCH)
+    values, divisions = [], 0
     for n, step in enumerate(recorded):
-        plain.step(step, weight_at(model, n))
+        w_s = weight_at(model, n) / model.ood_weight_decay**divisions
+        plain.step(step, w_s)
+        if model.adaptive_ood_weight and n % model.steps_per_epoch == 0:  # once per epoch, the linear part being over
+            recent, before = values[-5:], values[-20:-5]
+            divisions += n + 1 > model.ood_weight_steps and w_s > 0.2 and bool(before) and np.mean(recent) < np.mean(before)
+            values.append(plain.recorded)
+    assert divisions == model.n_ood_weight_decays and (divisions > 0) == (case == "adaptive_divides")
     assert largest_difference(all_tensors(model), plain.tensors()) <= 1e-10
     assert largest_difference(start, model.policy.state_dict()) > 1e-3
     assert plain.smallest == set(range(model.n_critics)), "each critic must be the smallest somewhere"

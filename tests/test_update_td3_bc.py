@@ -230,6 +230,13 @@ def test_observations_are_standardised_by_default_and_loaded_policies_take_raw_o
     assert np.allclose(loaded.predict(obs)[0], by_hand, atol=1e-4)
 
 
+def test_defaults_are_the_authors(transitions: Transitions) -> None:
+    model = OfflineTD3BC("MlpPolicy", dataset=transitions)
+    assert (model.alpha, model.policy_update_freq, model.learning_rate) == (2.5, 2, 3e-4)
+    assert (model.target_policy_noise, model.target_noise_clip) == (0.2, 0.5)
+    assert model.policy.critic_arch == [256, 256] and model.normalize_obs
+
+
 def test_prediction_is_deterministic(transitions: Transitions) -> None:
     model = OfflineTD3BC("MlpPolicy", dataset=transitions, policy_kwargs={"net_arch": [8]}, seed=0)
     obs = transitions.observations[:20]

@@ -381,12 +381,24 @@ def test_kl_divergence_is_a_mean_over_dimensions() -> None:
     assert float(kl) == pytest.approx((0.5 + 2.194528) / 2, abs=1e-6)
 
 
-@pytest.mark.parametrize(("width", "dropout"), [(256, 0.1), (16, 0.1), (64, 0.5), (256, 0.0), (1, 0.3)])
+@pytest.mark.parametrize(("width", "dropout"), [(256, 0.1), (16, 0.1), (64, 0.5), (256, 0.0), (1, 0.3), (2048, 0.1)])
 def test_masks_that_drop_more_than_counted_are_rare(width: int, dropout: float) -> None:
     bound = most_dropped(width, dropout)
     chances = th.distributions.Binomial(width, th.tensor(dropout, dtype=th.float64)).log_prob(th.arange(width + 1.0)).exp()
     assert float(chances[bound + 1 :].sum()) < 1e-9
     assert bound == 1 or float(chances[bound:].sum()) >= 1e-9
+
+
+def test_defaults_are_the_authors(transitions: Transitions) -> None:
+    model = OfflineUWAC("MlpPolicy", dataset=transitions)
+    assert (model.n_mc_dropout, model.n_target_actions, model.n_mmd_actions, model.n_predict_actions) == (100, 10, 4, 100)
+    assert (model.uwac_beta, model.critic_dropout, model.mmd_sigma, model.mmd_threshold) == (0.5, 0.1, 20.0, 0.07)
+    assert model.weight_squared and model.actor_q_timing == "previous"
+    assert model.policy.critic_arch == [256, 256] and model.policy.vae_net_arch == [750, 750]
+    assert model.vae.latent_dim == 2 * transitions.actions.shape[1]
+    rates = {name: value for name, value in model.coefficients(0).items() if "learning_rate" in name}
+    assert rates == {"learning_rate": 3e-4, "actor_learning_rate": 1e-4, "log_alpha_learning_rate": 1e-3}
+    assert [model.update_variant(n)["mmd_only"] for n in (0, 39_999, 40_000)] == [True, True, False]
 
 
 # -- networks ----------------------------------------------------------------------------------------------------------
