@@ -6,7 +6,6 @@ import io
 import sys
 import tempfile
 import traceback
-import warnings
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,6 +17,7 @@ from sb3_dce import cli_datasets
 from sb3_dce.checks import LAST_SEED
 from sb3_dce.cli_datasets import DatasetArgument
 from sb3_dce.errors import ConfigError, SB3DCEError
+from sb3_dce.messages import show_warnings_as_lines
 from sb3_dce.processes import usable_cores
 
 app = typer.Typer(
@@ -295,7 +295,7 @@ def main() -> None:
     Entry point: errors of this package are one message on stderr and exit code 2, others exit code 1 and a report in a file;
     never a traceback. Ctrl-C is exit code 130, typer's.
     """
-    warnings.showwarning = _show_warning  # type: ignore[assignment]
+    show_warnings_as_lines()
     for stream in (sys.stdout, sys.stderr):  # an encoding without a sign such as ± is no reason to end a training
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
@@ -319,8 +319,3 @@ def main() -> None:
             markup=False,
         )
         sys.exit(1)
-
-
-def _show_warning(message: Warning | str, category: type[Warning], *_: Any) -> None:
-    if "sb3_dce" in category.__module__:
-        Console(stderr=True, highlight=False, soft_wrap=True).print(f"Warning: {message}", markup=False)

@@ -24,10 +24,10 @@ from sb3_dce.noise import NoiseSpec
 from sb3_dce.policies import OfflineSACPolicy
 from sb3_dce.state import LearnedNumber, PureNet, Storage
 from sb3_dce.steps import action_metrics, descend, polyak, q_data_metrics
+from sb3_dce.warm_up import ActorWarmUp
 
 LAGRANGE = "log_lagrange"  # name of the multiplier's learner in the state tree
 LAGRANGE_FORMS = ("weighted_gap", "gap")
-ACTOR_Q_TIMINGS = ("previous", "updated")
 # The authors' code clips the multiplier here.
 MAX_LAGRANGE = 1e6
 
@@ -41,7 +41,7 @@ class CQLOptions(UpdateOptions):
     actor_q_timing: str
 
 
-class OfflineCQL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
+class OfflineCQL(ActorLearningRate, ActorWarmUp, EntropyCoefficient, OfflineAlgorithm):
     """
     Conservative Q-learning: SAC's critics with ``w * (log sum_a' exp Q(s, a') - Q(s, a))`` added to their loss.
 
@@ -65,7 +65,8 @@ class OfflineCQL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
     :param lagrange_form: with multiplier m and threshold t, ``"weighted_gap"`` is m (w gap - t), the authors' code,
         ``"gap"`` is m w (gap - t), as in the reimplementation by Geng
     :param max_q_backup: bootstrap on the best of ``n_actions`` policy actions at s' instead of on one (AntMaze)
-    :param policy_eval_start: updates at the start in which the actor clones the data instead of following Q
+    :param policy_eval_start: updates at the start in which the actor clones the data instead of following Q, for a run of a
+        million; a training that ends before is pure cloning, which a warning says
     :param actor_q_timing: critics of the actor loss: ``"previous"`` (before their step of this update, authors) or
         ``"updated"``
     """
@@ -163,8 +164,6 @@ class OfflineCQL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
         if self.lagrange_threshold is not None:
             check_number("lagrange_threshold", self.lagrange_threshold, 0, hint="None switches it off.")
         check_choice("lagrange_form", self.lagrange_form, LAGRANGE_FORMS)
-        check_number("policy_eval_start", self.policy_eval_start, 0, integer=True)
-        check_choice("actor_q_timing", self.actor_q_timing, ACTOR_Q_TIMINGS)
 
     def policy_settings(self) -> dict[str, Any]:
         return {**super().policy_settings(), "net_arch": [256, 256, 256]}
@@ -190,7 +189,7 @@ class OfflineCQL(ActorLearningRate, EntropyCoefficient, OfflineAlgorithm):
         return bound_update(update, options, nets, storages)
 
     def update_variant(self, n_updates: int) -> dict[str, Any]:
-        return {"clone": n_updates < self.policy_eval_start}
+        return {"clone": self.in_warm_up(n_updates)}
 
     def noise_specs(self, batch_size: int) -> dict[str, NoiseSpec]:
         action_dim = get_action_dim(self.action_space)

@@ -22,6 +22,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from sb3_dce import runs
 from sb3_dce.errors import DivergenceError, SB3DCEError
 from sb3_dce.evaluation import Evaluation
+from sb3_dce.messages import show_warnings_as_lines
 from sb3_dce.processes import prepare_worker, termination_as_interrupt, threads_from_environment, usable_cores
 from sb3_dce.runs import RunSpec
 
@@ -252,6 +253,7 @@ def _prepare(threads: int, events: Connection, stop: Any) -> None:
     global _events, _stop
     _events, _stop = events, stop
     prepare_worker()
+    show_warnings_as_lines()
     th.set_num_threads(threads)
 
 

@@ -14,13 +14,14 @@ from sb3_dce import losses
 from sb3_dce.actor_rate import ActorLearningRate
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
-from sb3_dce.checks import check_choice, check_number, check_widths
+from sb3_dce.checks import check_number, check_widths
 from sb3_dce.execution import Update, UpdateOptions, bound_update
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.state import LearnedNumber, PureNet, Storage
 from sb3_dce.steps import action_metrics, descend, polyak, q_data_metrics
 from sb3_dce.uwac_networks import ActionVAE, DropoutCritic
 from sb3_dce.uwac_policy import VAE_NET_ARCH, UWACPolicy
+from sb3_dce.warm_up import ActorWarmUp
 
 # Names in the state tree: the multiplier of the MMD constraint, and the vectors of the critics' power iteration.
 LOG_ALPHA = "log_alpha"
@@ -40,7 +41,7 @@ class UWACOptions(UpdateOptions):
     actor_q_timing: str
 
 
-class OfflineUWAC(ActorLearningRate, OfflineAlgorithm):
+class OfflineUWAC(ActorLearningRate, ActorWarmUp, OfflineAlgorithm):
     """
     Uncertainty-weighted actor-critic: targets of uncertain next actions count less.
 
@@ -72,7 +73,8 @@ class OfflineUWAC(ActorLearningRate, OfflineAlgorithm):
     :param n_mmd_actions: actions of policy and autoencoder in the MMD
     :param mmd_sigma: width of the Gaussian kernel, in squared units of actions before tanh
     :param mmd_threshold: MMD above which alpha rises
-    :param policy_eval_start: updates in which the actor follows the MMD alone
+    :param policy_eval_start: updates in which the actor follows the MMD alone, for a run of a million; a warning says if a
+        training ends before
     :param actor_q_timing: critics of the actor loss: ``"previous"`` (before their step of this update, authors' code) or
         ``"updated"``
     :param n_predict_actions: actions drawn for a prediction
@@ -184,8 +186,6 @@ class OfflineUWAC(ActorLearningRate, OfflineAlgorithm):
         check_number("mmd_threshold", self.mmd_threshold, 0, hint="The authors use 0.07.")
         for name in ("n_target_actions", "n_mmd_actions", "n_predict_actions"):
             check_number(name, getattr(self, name), 1, integer=True)
-        check_number("policy_eval_start", self.policy_eval_start, 0, integer=True)
-        check_choice("actor_q_timing", self.actor_q_timing, ("previous", "updated"))
         if self.vae_net_arch is not None:
             check_widths("vae_net_arch", self.vae_net_arch)
 
@@ -233,7 +233,7 @@ class OfflineUWAC(ActorLearningRate, OfflineAlgorithm):
         return bound_update(update, options, nets, storages)
 
     def update_variant(self, n_updates: int) -> dict[str, Any]:
-        return {"mmd_only": n_updates < self.policy_eval_start}
+        return {"mmd_only": self.in_warm_up(n_updates)}
 
     def noise_specs(self, batch_size: int) -> dict[str, NoiseSpec]:
         action_dim, critic = get_action_dim(self.action_space), self.critic

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import copy
 import math
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from update_tools import (
 
 from sb3_dce import OfflineCQL, Transitions, ensembles, hyperparams, losses
 from sb3_dce.cql import CQLOptions, _penalties
-from sb3_dce.errors import CheckpointError
+from sb3_dce.errors import CheckpointError, SB3DCEWarning
 
 BATCH, ACTIONS = 8, 3
 
@@ -340,6 +341,17 @@ def test_defaults_are_the_authors(transitions: Transitions) -> None:
 def test_rows_have_the_authors_values(dataset: str, weight: float, threshold: float | None) -> None:
     row = hyperparams.load_row("offline_cql", dataset)
     assert (row["cql_weight"], row["lagrange_threshold"], row["policy_eval_start"]) == (weight, threshold, 40_000)
+
+
+def test_training_that_is_cloning_alone_says_so(transitions: Transitions) -> None:
+    model = make_model(transitions, policy_eval_start=5)
+    with pytest.warns(SB3DCEWarning, match=r"ignores the critics in all updates from 0 to 4.*policy_eval_start=5"):
+        model.learn(4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", SB3DCEWarning)
+        model.learn(2, reset_num_timesteps=False)  # updates 5 and 6
+        assert model._n_updates == 6
+        model.learn(1)
 
 
 def test_optimizers_show_the_rate_of_their_network(transitions: Transitions) -> None:
