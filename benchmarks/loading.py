@@ -220,7 +220,7 @@ def machine() -> dict[str, Any]:
         "processor": names[0] if names else platform.processor(),
         "cores": os.cpu_count(),
         "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
-        "system": platform.platform(terse=True),
+        "system": platform.system(),
         "python": platform.python_version(),
         **{name: version(name) for name in ("numpy", "h5py", "pandas", "torch", "stable_baselines3")},
         "sb3_dce": __version__,  # which need not be installed

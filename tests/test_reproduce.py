@@ -398,6 +398,16 @@ def test_two_nodes_of_a_ray_cluster_train_what_one_machine_trains(tmp_path: Path
     assert train(plan, ray_address="auto") == [] and models(tmp_path / "cluster") == stamp, "complete: no cluster is asked for"
 
 
+def test_nodes_keep_runs_of_other_folders_and_versions_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from sb3_dce.experiments import cluster
+
+    spec = small_plan("fig-cql-return", tmp_path)[0].spec
+    asker = cluster.asker_of(spec)
+    assert asker == cluster.asker_of(spec) != cluster.asker_of(replace(spec, folder=str(tmp_path / "fresh" / "run")))
+    monkeypatch.setattr(cluster, "source_commit", lambda: "another")
+    assert cluster.asker_of(spec) != asker
+
+
 def test_cluster_that_is_not_there_is_said_in_one_sentence(tmp_path: Path) -> None:
     pytest.importorskip("ray")
     with pytest.raises(ConfigError, match=r"no Ray cluster at 127\.0\.0\.1:1"):

@@ -2,12 +2,14 @@
 Runs on the nodes of a Ray cluster (extra ``[cluster]``). Nothing is shared but the network: a node finds the data by their
 id on its own disk, trains in a folder of its own cache, and sends the files of the complete run back.
 
-A node that is given an interrupted run again goes on from its checkpoint; another node begins it anew. What has arrived
-here is never run again.
+A node that is given an interrupted run again goes on from its checkpoint; another node begins it anew, and so does one that is
+asked by another folder or another version of this package. What has arrived here is never run again.
 """
 
 from __future__ import annotations
 
+import hashlib
+import platform
 import socket
 import traceback
 from collections.abc import Sequence
@@ -17,9 +19,10 @@ from typing import Any, NamedTuple
 
 from rich.console import Console
 
+import sb3_dce
 from sb3_dce.errors import ConfigError, DivergenceError, SB3DCEError
 from sb3_dce.files import write_atomically
-from sb3_dce.runs import RunSpec
+from sb3_dce.runs import RunSpec, source_commit
 
 # Written last: they are the marks of a complete run.
 MARKS = ("result.json", "diverged.json")
@@ -84,7 +87,10 @@ def _knock(address: str) -> None:
 
 def _collect(ray: Any, specs: Sequence[RunSpec], console: Console) -> list[BaseException]:
     remote = ray.remote(num_cpus=1, max_retries=2, scheduling_strategy="SPREAD")(train_on_node)
-    waiting = {remote.remote(spec): spec for spec in specs}
+    waiting = {remote.remote(spec, asker_of(spec)): spec for spec in specs}
+    console.print(
+        f"{len(specs)} runs wait for the {ray.cluster_resources().get('CPU', 0):g} cores of the cluster", markup=False
+    )
     failures: list[BaseException] = []
     while waiting:
         (ready,), _ = ray.wait(list(waiting), num_returns=1)
@@ -109,15 +115,25 @@ class NodeError(SB3DCEError):
     """A run failed on a node of the cluster."""
 
 
-def train_on_node(spec: RunSpec) -> Outcome:
+def asker_of(spec: RunSpec) -> str:
+    """
+    :param spec: run, with its folder on this machine
+    :return: what tells apart who asks for it: machine, folder, and version of this package
+    """
+    folder = Path(spec.folder).absolute().as_posix()
+    text = f"{platform.node()} {folder} {sb3_dce.__version__} {source_commit()}"
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def train_on_node(spec: RunSpec, asker: str) -> Outcome:
     """
     What a node does.
 
     :param spec: run, with the folder it has on the machine that asked for it
+    :param asker: from :func:`asker_of`
     :return: its files
     """
     import os
-    import platform
 
     import torch as th
 
@@ -127,7 +143,7 @@ def train_on_node(spec: RunSpec) -> Outcome:
 
     th.set_num_threads(threads_from_environment() or 1)
     node = os.environ.get("SB3_DCE_NODE") or platform.node()
-    folder = cache_folder().parent / "cluster" / node / Path(spec.folder).name
+    folder = cache_folder().parent / "cluster" / node / f"{Path(spec.folder).name}--{asker}"
     here = replace(spec, folder=str(folder))
     try:
         launch.train_one(here, lambda progress: None)

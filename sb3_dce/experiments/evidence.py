@@ -334,7 +334,7 @@ class Evidence:
         text = small if self.scale.source == "embedded" else ""
         text += f"Data: {'; '.join(data)}. Gradient steps: {_listed(lengths)}; seeds: {_listed(counts)}; last policy"
         text += f", {_listed(episodes)} episode{'' if episodes[-1] == 1 else 's'}" if episodes else ""
-        text += f". Code {', '.join(sorted(rows['code_version'].unique()))}."
+        text += f". Code (version+commit): {', '.join(sorted(rows['code_version'].unique()))}."
         ran = [v for v in shown if any(len(self.runs(v, n)) or len(self.of_other_length(v, n)) for n in ids)]
         changed = {v.name: known for v in ran if (known := self._scale_settings(v))}
         if changed and self.scale.source != "embedded":

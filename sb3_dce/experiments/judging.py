@@ -25,7 +25,7 @@ TENTH = "means over the last tenth of the run"
 SEED_STD = 4.2
 SEED_STD_FREEDOM = 4
 CLEARLY = (
-    "clearly: outside of the 95 % interval of Welch's test over seeds; an agent with fewer than three has the largest "
+    "outside of the 95 % interval of Welch's test over seeds, where an agent with fewer than three has the largest "
     f"standard deviation of any agent on these data, at least {SEED_STD:g} (DCE on HalfCheetah, five seeds)"
 )
 # Below this score a policy does not do its task, so that comparisons of it say nothing.

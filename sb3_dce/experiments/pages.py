@@ -52,7 +52,7 @@ def write_page(path: Path, out: Path, evidences: Mapping[str, Evidence], reports
         "each number. Its schedules change beta for the first time after 50,000 steps: shorter runs have the first beta "
         "throughout.",
         f"Verdicts: {count(every)}.",
-        f"In their rules, {CLEARLY}.",
+        f'In the rules below "clearly" means {CLEARLY}.',
         "## The paper's claims",
         claim_table(evidences, judged).markdown(),
         "## What the paper's own tables say",

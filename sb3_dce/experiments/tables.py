@@ -260,7 +260,8 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
         )
     note = (
         f"Over {_counted(len(ids))} on which the paper's agents have runs of one length; those that were run on fewer than "
-        "half of the data are left out. Each data set has the same weight. The interval is a "
+        "half of the data are left out. IQM is the mean of the middle half of all scores, P(DCE > agent) the share of pairs "
+        "of runs on the same data in which DCE scores more. Each data set has the same weight. The interval is a "
         f"stratified bootstrap over seeds within data sets ({N_RESAMPLES:,} resamples; none with one seed); the deviation of "
         f"the total takes the rows as independent. {MIXED_PROTOCOLS}"
     )
