@@ -146,7 +146,7 @@ class BatchedRuns:
             task = display.add_task(
                 f"{len(self.specs)} x {self.specs[0].algo}", total=self.total, completed=population.n_updates
             )
-            while population.n_updates < self.total:
+            while population.n_updates < self.total and len(self._diverged) < len(self.specs):
                 self._train_until_due(population, display, task)
                 self._log_metrics(population)
                 if population.n_updates % self.eval_freq == 0:
@@ -168,11 +168,13 @@ class BatchedRuns:
     def _population(self) -> Population:
         agent, state = agent_class(self.specs[0].algo), self._state_path
         saved = th.load(state, weights_only=True) if state.is_file() else None
+        self._diverged = {} if saved is None else dict(saved.get("diverged", {}))
         models: list[OfflineAlgorithm] = []
-        for spec, folder in zip(self.specs, self.folders, strict=True):
-            if saved is None:
+        for index, (spec, folder) in enumerate(zip(self.specs, self.folders, strict=True)):
+            if saved is None or index in self._diverged:
+                # one that has diverged keeps its place, so that the others draw the numbers they would have drawn
                 model = agent.load_dataset(spec.dataset, seed=spec.seed, **{**spec.overrides, "device": "cpu"})
-                model.num_timesteps = 0
+                model.num_timesteps = model._n_updates = 0 if saved is None else saved["n_updates"]
             else:
                 model = agent.load(folder / _checkpoint(saved["n_updates"]), device="cpu")
                 model.set_dataset(spec.dataset)
@@ -249,15 +251,17 @@ class BatchedRuns:
             show_evaluation(self.console, self.specs[index].name, outcome)
 
     def _save(self, population: Population, seconds: float) -> None:
-        """All members, then the file that says so; what is older goes last. A kill at any point leaves a whole set."""
+        """
+        All members that have not diverged, then the file that says so; what is older goes last. A kill at any point leaves a
+        whole set.
+        """
         n = population.n_updates
         for index, (model, folder) in enumerate(zip(population.models, self.folders, strict=True)):
-            if not self._diverged:
+            if index not in self._diverged:
                 self._save_member(index, model, folder / _checkpoint(n), n)
-        if self._diverged:
-            return  # a member that cannot be saved cannot be resumed: the last whole set stays
+        state = {"n_updates": n, "random_state": population.random_state(), "seconds": seconds, "diverged": self._diverged}
         with write_atomically(self._state_path) as stream:
-            th.save({"n_updates": n, "random_state": population.random_state(), "seconds": seconds}, stream)
+            th.save(state, stream)
         for folder in self.folders:
             for path in folder.glob("checkpoint_*.zip"):
                 if path.name != _checkpoint(n):

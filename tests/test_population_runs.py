@@ -96,12 +96,38 @@ def test_members_that_diverge_are_named_and_the_others_finish(tmp_path: Path) ->
     assert read_divergence(tmp_path / "seed_0") is None and read_divergence(tmp_path / "seed_1") is not None
 
 
-def test_nothing_is_saved_that_could_not_be_resumed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    members = specs(tmp_path)
-    members[1].overrides["learning_rate"] = 1e30
-    monkeypatch.setattr(BatchedRuns, "_finish", lambda *_: [])
-    BatchedRuns(members, CPU, "eager", Console(quiet=True)).run()
-    assert not list(tmp_path.glob("*/checkpoint_*.zip"))
+def test_population_goes_on_without_the_member_that_diverged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def population(folder: Path) -> BatchedRuns:
+        members = specs(folder)
+        members[1].overrides["learning_rate"] = 1e30
+        return BatchedRuns(members, CPU, "eager", Console(quiet=True))
+
+    killed, original = population(tmp_path / "killed"), BatchedRuns._save
+
+    def save_once(self: BatchedRuns, *arguments: Any) -> None:
+        original(self, *arguments)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(BatchedRuns, "_save", save_once)
+        killed.run()
+    saved = [path.parent.name for path in (tmp_path / "killed").glob("*/checkpoint_*.zip")]
+    assert saved == ["seed_0"] and set(killed._diverged) == {1}
+    for kind in ("killed", "whole"):
+        with pytest.raises(DivergenceError, match=r"1 of 2 members diverged: dce seed 1"):
+            population(tmp_path / kind).run()
+    one, other = (OfflineDCE.load(tmp_path / kind / "seed_0" / "model.zip") for kind in ("killed", "whole"))
+    assert one._n_updates == other._n_updates == specs(tmp_path)[0].n_updates
+    assert largest_difference(all_tensors(one), all_tensors(other)) == 0.0
+    assert not list(tmp_path.rglob("checkpoint_*")) and not (tmp_path / "killed" / STATE_FILE).exists()
+
+
+def test_population_ends_when_all_have_diverged(tmp_path: Path) -> None:
+    members = specs(tmp_path, learning_rate=1e30)
+    with pytest.raises(DivergenceError, match="2 of 2 members diverged"):
+        BatchedRuns(members, CPU, "eager", Console(quiet=True)).run()
+    ended = read_divergence(tmp_path / "seed_0")
+    assert ended is not None and ended["n_updates"] == members[0].eval_freq < members[0].n_updates
 
 
 def test_evaluation_in_a_worker_is_kept_if_the_run_is_killed_at_its_end(
