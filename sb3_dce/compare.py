@@ -24,7 +24,7 @@ from sb3_dce.errors import ConfigError, DivergenceError
 from sb3_dce.evaluation import read_evaluations
 from sb3_dce.files import write_text
 from sb3_dce.hyperparams import check_keys, full_name
-from sb3_dce.launch import launch_all
+from sb3_dce.launch import launch_all, raise_first
 from sb3_dce.plots import plot_learning_curves
 from sb3_dce.runs import RunSpec, check_before_running, last_metrics, read_divergence, read_result
 
@@ -123,8 +123,7 @@ def compare(
     # What diverges is a result. Other errors are said below the table of what is complete.
     errors = [o for o in outcomes if isinstance(o, BaseException) and not isinstance(o, DivergenceError)]
     rows = summarize(folder, specs, spec, level, console) if len(errors) < len(specs) else []
-    if errors:
-        raise errors[0]
+    raise_first(errors, console)
     return rows
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -27,7 +28,7 @@ def differences(algo: str, dataset_id: str | None, overrides: dict[str, Any]) ->
     :param overrides: constructor arguments that replace those of the row
     :return: JSON of those that differ from the row and, where it is silent, from the constructor's defaults
     """
-    in_force = {**defaults_of(algo), **row_of(algo, dataset_id)}
+    in_force = settings_in_force(algo, dataset_id, {})
     return _json({k: v for k, v in overrides.items() if k not in NOT_HYPERPARAMETERS and in_force.get(k) != v})
 
 
@@ -63,6 +64,16 @@ def defaults_of(algo: str) -> dict[str, Any]:
     :return: default of each argument of its constructor
     """
     return {name: p.default for name, p in inspect.signature(agent_class(algo)).parameters.items() if name[0] != "_"}
+
+
+def settings_in_force(algo: str, dataset_id: str | None, overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    :param algo: name of the agent
+    :param dataset_id: id of the catalogue, whose row of the hyperparameter file applies
+    :param overrides: constructor arguments that replace those of the row
+    :return: every argument of the agent's constructor
+    """
+    return {**defaults_of(algo), **row_of(algo, dataset_id), **overrides}
 
 
 def _json(values: dict[str, Any]) -> str:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing as mp
+import signal
 import sys
 import threading
-import time
 import traceback
 from collections.abc import Callable, Sequence
-from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import connection
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from sb3_dce.errors import DivergenceError, SB3DCEError
 from sb3_dce.evaluation import Evaluation
 from sb3_dce.messages import show_warnings_as_lines
 from sb3_dce.processes import prepare_worker, termination_as_interrupt, threads_from_environment, usable_cores
-from sb3_dce.runs import RunSpec
+from sb3_dce.runs import RunSpec, StoppedError
 
 # With more runs than this the bars of those that are done make room for the others.
 BARS_KEPT = 20
@@ -64,6 +64,18 @@ def launch_all(specs: Sequence[RunSpec], workers: int, console: Console) -> list
     return [future.exception() or future.result() for future in futures]
 
 
+def raise_first(errors: Sequence[BaseException], console: Console) -> None:
+    """
+    :param errors: of runs, after what is complete has been shown; all but the first are printed
+    :param console: where they are printed
+    :raises BaseException: the first
+    """
+    for error in errors[1:]:
+        console.print(f"failed: {error}", markup=False, soft_wrap=True)
+    if errors:
+        raise errors[0]
+
+
 class _Workers:
     """
     A process for each thread that asks for one; it trains one run after the other.
@@ -72,13 +84,14 @@ class _Workers:
     would fail as a whole, and a lock of a common queue would stay closed for the others.
 
     :param threads: of PyTorch in each process
+    :param report: called with the progress of the runs, by the thread that waits for the run
     """
 
-    def __init__(self, threads: int) -> None:
-        self._threads, self._context = threads, mp.get_context("spawn")
+    def __init__(self, threads: int, report: runs.Report) -> None:
+        self._threads, self._report, self._context = threads, report, mp.get_context("spawn")
         self._own, self._lock = threading.local(), threading.Lock()
-        self._pools: list[ProcessPoolExecutor] = []
-        self._events: list[Connection] = []
+        self._processes: list[BaseProcess] = []
+        self._ends: list[Connection] = []
         self._stop = self._context.RawValue("b", 0)
         self._ended = False
 
@@ -86,108 +99,104 @@ class _Workers:
         """
         :param spec: what is to be run
         :return: its result
-        :raises RunFailedError: if its process is killed; the next run of this thread gets a new one
+        :raises RunFailedError: if no process can be started, or it is killed; the next run of this thread gets a new one
         """
         try:
-            return self._submit(spec).result()
-        except BrokenProcessPool as error:
-            self._own.pool = None
+            end = self._end_of_own_process()
+            end.send(spec)
+            while isinstance(message := end.recv(), runs.Progress):
+                self._report(message)
+        except (EOFError, ConnectionError) as error:
+            self._own.end = None
             raise RunFailedError(
                 f"the process of {spec.name} was ended from outside, as the system does when memory is short",
                 hint="Use fewer --workers; the same command goes on from the last checkpoint. A script that starts processes "
                 'must do so below if __name__ == "__main__":.',
             ) from error
+        except OSError as error:
+            hint = "Use fewer --workers; the same command goes on."
+            raise RunFailedError(f"no process for {spec.name}: {error.strerror or error}", hint=hint) from error
+        if isinstance(message, BaseException):
+            raise message
+        return message
 
-    def _submit(self, spec: RunSpec) -> Future[dict[str, Any]]:
-        with self._lock:
-            if self._ended:
-                raise CancelledError
-            pool = getattr(self._own, "pool", None)
-            if pool is not None:
-                return pool.submit(_run, spec)
-            events, end = self._context.Pipe(duplex=False)
-            arguments = (self._threads, end, self._stop)
-            self._own.pool = pool = ProcessPoolExecutor(1, mp_context=self._context, initializer=_prepare, initargs=arguments)
-            self._pools.append(pool)
-            self._events.append(events)
-            future = pool.submit(_run, spec)
-            end.close()  # the process has it now, and with the process it closes
-            return future
-
-    def next_events(self, seconds: float) -> list[runs.Progress]:
-        """
-        :param seconds: how long to wait for one
-        :return: reports of runs, none if nothing has happened
-        """
-        with self._lock:
-            open_ends = list(self._events)
-        if not open_ends:
-            time.sleep(seconds)
-            return []
-        events = []
-        ready = connection.wait(open_ends, seconds)
-        for end in (end for end in open_ends if end in ready):
-            try:
-                events.append(end.recv())
-            except (EOFError, OSError):
-                with self._lock:
-                    self._events.remove(end)
-        return events
+    def _end_of_own_process(self) -> Connection:
+        if getattr(self._own, "end", None) is None:
+            with self._lock:
+                if self._ended:
+                    raise CancelledError
+                here, there = self._context.Pipe()
+                with there:  # the process has it then, and with the process it closes
+                    process = self._context.Process(target=_serve, args=(there, self._threads, self._stop))
+                    process.start()
+                self._processes.append(process)
+                self._ends.append(here)
+                self._own.end = here
+        return self._own.end
 
     def save_and_end(self) -> None:
         """Tell all runs to save where they are, and to end."""
         self._stop.value = 1
 
-    def terminate(self) -> None:
-        """End the processes at once, whatever they are doing."""
+    def close(self, at_once: bool) -> None:
+        """
+        :param at_once: end the processes whatever they are doing; else they have nothing left to do, and end by themselves
+        """
         with self._lock:
             self._ended = True
-        for pool in self._pools:
-            for process in list((pool._processes or {}).values()):
-                process.terminate()
-
-    def close(self) -> None:
-        """Let the processes go, which have nothing left to do."""
-        for pool in self._pools:
-            pool.shutdown()
+        for process in self._processes if at_once else ():
+            process.kill()  # they do not listen to SIGTERM
+        for end in self._ends:
+            end.close()
+        for process in self._processes:
+            process.join()
 
 
 def _launch(specs: Sequence[RunSpec], n_workers: int, console: Console, keep_going: bool) -> list[Future[Any]]:
     n_workers = max(1, min(n_workers, len(specs)))
-    # The user's own setting wins: more threads than free cores make PyTorch many times slower.
-    workers = _Workers(threads_from_environment() or max(1, usable_cores() // n_workers))
     with progress_display(console) as display, ThreadPoolExecutor(n_workers) as threads:
+        # The user's own setting wins: more threads than free cores make PyTorch many times slower.
+        workers = _Workers(threads_from_environment() or max(1, usable_cores() // n_workers), _Bars(specs, display).show)
         futures = [threads.submit(workers.run, spec) for spec in specs]
         try:
             with termination_as_interrupt():
                 try:
-                    _show_until_done(futures, workers, specs, display, keep_going)
+                    _wait(futures, keep_going)
                 except KeyboardInterrupt:
                     _save_and_end(futures, workers, display.console)
                     raise
-            return futures
         except BaseException:
             # Without this an error would wait for every other run to finish.
             for future in futures:
                 future.cancel()
-            workers.terminate()
+            workers.close(at_once=True)
             raise
-        finally:
-            workers.close()
+        workers.close(at_once=False)
+        return futures
+
+
+def _wait(futures: Sequence[Future[Any]], keep_going: bool) -> None:
+    waiting = set(futures)
+    while waiting:
+        done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)  # Windows hears no Ctrl-C while it waits
+        for future in done:
+            if not keep_going:
+                future.result()
 
 
 def _save_and_end(futures: Sequence[Future[Any]], workers: _Workers, console: Console) -> None:
     """Let each run save where it is; a second Ctrl-C does not wait for that."""
     console.print("Interrupted: saving what is being trained. Ctrl-C again ends at once.", markup=False)
-    for future in futures:
-        future.cancel()
+    begun = [future for future in futures if not future.cancel()]
     workers.save_and_end()
-    try:
-        late = wait(futures, SAVING_SECONDS).not_done
-    except KeyboardInterrupt:
-        late = {future for future in futures if not future.done()}
-    where = "the last checkpoints" if late else "there"
-    console.print(f"The same command goes on from {where}.", markup=False)
+    with contextlib.suppress(KeyboardInterrupt):
+        wait(begun, SAVING_SECONDS)
+    failed = [error for future in begun if future.done() and (error := future.exception()) is not None]
+    failed = [error for error in failed if not isinstance(error, StoppedError)]
+    for error in failed:
+        console.print(f"failed: {error}", markup=False, soft_wrap=True)
+    saved = not failed and all(future.done() for future in begun)
+    console.print(f"The same command goes on from {'there' if saved else 'the last checkpoints'}.", markup=False)
 
 
 def progress_display(console: Console) -> Progress:
@@ -209,27 +218,30 @@ def progress_display(console: Console) -> Progress:
     )
 
 
-def _show_until_done(
-    futures: list[Future[Any]], workers: _Workers, specs: Sequence[RunSpec], display: Progress, keep_going: bool
-) -> None:
-    tasks: dict[str, TaskID] = {}
-    totals = {spec.name: spec.n_updates for spec in specs}
-    while True:
-        events = workers.next_events(0.2)
-        if not events:
-            failed = [future for future in futures if future.done() and future.exception() is not None]
-            if failed and not keep_going:
-                failed[0].result()
-            if all(future.done() for future in futures):
-                return
-        for event in events:
-            if event.name not in tasks:
-                tasks[event.name] = display.add_task(event.name, total=totals[event.name])
-            display.update(tasks[event.name], completed=event.n_updates)
-            if event.n_updates >= totals[event.name] and len(specs) > BARS_KEPT:
-                display.remove_task(tasks.pop(event.name))
-            if event.evaluation is not None:
-                show_evaluation(display.console, event.name, event.evaluation)
+class _Bars:
+    """
+    A bar for each run that has begun.
+
+    :param specs: the runs
+    :param display: where the bars are shown
+    """
+
+    def __init__(self, specs: Sequence[RunSpec], display: Progress) -> None:
+        self._totals, self._display = {spec.name: spec.n_updates for spec in specs}, display
+        self._tasks: dict[str, TaskID] = {}
+
+    def show(self, event: runs.Progress) -> None:
+        """
+        :param event: of one of the runs
+        """
+        total, display = self._totals[event.name], self._display
+        if event.name not in self._tasks:
+            self._tasks[event.name] = display.add_task(event.name, total=total)
+        display.update(self._tasks[event.name], completed=event.n_updates)
+        if event.n_updates >= total and len(self._totals) > BARS_KEPT:
+            display.remove_task(self._tasks.pop(event.name))
+        if event.evaluation is not None:
+            show_evaluation(display.console, event.name, event.evaluation)
 
 
 def show_evaluation(console: Console, name: str, outcome: Evaluation) -> None:
@@ -243,22 +255,21 @@ def show_evaluation(console: Console, name: str, outcome: Evaluation) -> None:
     console.print(line, highlight=False)
 
 
-# Where a worker process reports to, and what tells it to save and end; set when it starts, since neither can be sent with
-# each task.
-_events: Any = None
-_stop: Any = None
-
-
-def _prepare(threads: int, events: Connection, stop: Any) -> None:
-    global _events, _stop
-    _events, _stop = events, stop
+def _serve(end: Connection, threads: int, stop: Any) -> None:
+    """What a process does: train what it is sent, report, send back the result or the error."""
     prepare_worker()
+    # for the parent, too, which tells when to save; whoever ends a whole group of processes sends it to all of them
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     show_warnings_as_lines()
     th.set_num_threads(threads)
-
-
-def _run(spec: RunSpec) -> dict[str, Any]:
-    return train_one(spec, _events.send, lambda: bool(_stop.value))
+    with contextlib.suppress(EOFError, ConnectionError):
+        while True:
+            spec = end.recv()
+            try:
+                outcome: dict[str, Any] | Exception = train_one(spec, end.send, lambda: bool(stop.value))
+            except Exception as error:
+                outcome = error.with_traceback(None)
+            end.send(outcome)
 
 
 def train_one(spec: RunSpec, report: runs.Report, stop: Callable[[], bool] = lambda: False) -> dict[str, Any]:

@@ -30,7 +30,7 @@ from sb3_dce.evaluation_pool import EvaluationPool, PendingEpisodes
 from sb3_dce.files import write_atomically
 from sb3_dce.launch import launch, progress_display, show_evaluation
 from sb3_dce.population import Population
-from sb3_dce.processes import usable_cores
+from sb3_dce.processes import termination_as_interrupt, usable_cores
 from sb3_dce.rollouts import Rollouts, rollouts_of
 from sb3_dce.runs import RunSpec, alone, read_result, refuse_other_run, write_config, write_divergence, write_result
 
@@ -142,20 +142,30 @@ class BatchedRuns:
         self._say_memory(population)
         started = time.monotonic() - self._seconds_before
         self._evaluate_again(population)
-        with progress_display(self.console) as display:
+        with progress_display(self.console) as display, termination_as_interrupt():
             task = display.add_task(
                 f"{len(self.specs)} x {self.specs[0].algo}", total=self.total, completed=population.n_updates
             )
-            while population.n_updates < self.total and len(self._diverged) < len(self.specs):
-                self._train_until_due(population, display, task)
-                self._log_metrics(population)
-                if population.n_updates % self.eval_freq == 0:
-                    self._evaluate(population.models, population.n_updates)
-                else:  # the end: the checkpoint that could be evaluated again is about to go
-                    self._collect_evaluations()
+            try:
+                self._train(population, display, task, started)
+            except KeyboardInterrupt:
+                self.console.print("Interrupted: saving what is being trained.", markup=False)
+                self._collect_evaluations()  # of an earlier moment, whose checkpoint is about to go
                 self._save(population, time.monotonic() - started)
+                self.console.print("The same command goes on from there.", markup=False)
+                raise
         self._collect_evaluations()
         return self._finish(population, time.monotonic() - started)
+
+    def _train(self, population: Population, display: Progress, task: TaskID, started: float) -> None:
+        while population.n_updates < self.total and len(self._diverged) < len(self.specs):
+            self._train_until_due(population, display, task)
+            self._log_metrics(population)
+            if population.n_updates % self.eval_freq == 0:
+                self._evaluate(population.models, population.n_updates)
+            else:  # the end: the checkpoint that could be evaluated again is about to go
+                self._collect_evaluations()
+            self._save(population, time.monotonic() - started)
 
     def _train_until_due(self, population: Population, display: Progress, task: TaskID) -> None:
         due = min(self.total, (population.n_updates // self.eval_freq + 1) * self.eval_freq)

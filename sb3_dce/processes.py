@@ -13,31 +13,44 @@ from contextlib import contextmanager
 from types import FrameType
 
 
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Handler of SIGTERM: often sent more than once, only the first counts."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    raise KeyboardInterrupt
+
+
+# What raises KeyboardInterrupt where nobody else handles the signal.
+INTERRUPTING = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: _interrupt}
+
+
 class UninterruptedBlock:
     """
-    Ctrl-C waits for the end of the block, so that nothing is left half done; a second one does not wait.
+    Ctrl-C, or SIGTERM where it means the same, waits for the end of the block, so that nothing is left half done; a second
+    Ctrl-C does not wait.
 
-    Only in the main thread, where Python delivers it, and only if nobody has replaced Python's own handler.
+    Only in the main thread, where Python delivers signals, and only if nobody has replaced the handler.
     """
 
     def __enter__(self) -> UninterruptedBlock:
-        self._asked = False
+        self._asked: signal.Signals | None = None
         here = threading.current_thread() is threading.main_thread()
-        self._replaced = here and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-        if self._replaced:
-            signal.signal(signal.SIGINT, self._note)
+        self._replaced = {n: handler for n, handler in INTERRUPTING.items() if here and signal.getsignal(n) is handler}
+        for number in self._replaced:
+            signal.signal(number, self._note)
         return self
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        if self._asked:
-            signal.default_int_handler(number, frame)
-        self._asked = True
+        if self._asked is not None:
+            if number == signal.SIGINT:
+                signal.default_int_handler(number, frame)
+            return
+        self._asked = signal.Signals(number)
         print("Ending after this update; Ctrl-C again ends at once.", file=sys.stderr, flush=True)
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if self._replaced:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-        if self._asked and kind is None:
+        for number, handler in self._replaced.items():
+            signal.signal(number, signal.SIG_IGN if number == self._asked == signal.SIGTERM else handler)
+        if self._asked is not None and kind is None:
             raise KeyboardInterrupt
 
 
@@ -51,7 +64,7 @@ def termination_as_interrupt() -> Iterator[None]:
     here = threading.current_thread() is threading.main_thread()
     replaced = here and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     if replaced:
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, _interrupt)
     try:
         yield
     finally:

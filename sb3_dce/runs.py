@@ -26,7 +26,7 @@ from stable_baselines3.common.logger import Logger, make_output_format
 import sb3_dce
 from sb3_dce.agents import agent_class
 from sb3_dce.base import OfflineAlgorithm
-from sb3_dce.configuration import NOT_HYPERPARAMETERS, defaults_of, row_of
+from sb3_dce.configuration import NOT_HYPERPARAMETERS, settings_in_force
 from sb3_dce.data import find_file
 from sb3_dce.data.hashes import sha256_once
 from sb3_dce.data.locate import catalogue_id, short_name
@@ -103,7 +103,9 @@ class _ReportCallback(BaseCallback):
         if now >= self._next or self.num_timesteps == self._spec.n_updates:
             self._next = now + REPORT_INTERVAL
             self._report(Progress(self._spec.name, self.num_timesteps, self._spec.n_updates))
-        return not self._stop()
+        # in the middle of a chunk of updates an evaluation may still be due
+        chunk: Any = getattr(self.model, "gradient_steps", 1)
+        return self.num_timesteps % chunk != 0 or not self._stop()
 
 
 class StoppedError(SB3DCEError):
@@ -192,15 +194,17 @@ def _train(spec: RunSpec, model: OfflineAlgorithm, folder: Path, report: Report,
     )
     evaluating.evaluations = [e for e in evaluating.evaluations if e.n_updates <= model.num_timesteps]
     started, seconds_before = time.monotonic(), _seconds_before(folder)
-    remaining = spec.n_updates - model.num_timesteps
+    remaining, log_interval = spec.n_updates - model.num_timesteps, min(1000, spec.eval_freq)
     if remaining > 0:
         model.learn(
             remaining,
             callback=[evaluating, _ReportCallback(spec, report, stop)],
-            log_interval=min(1000, spec.eval_freq),
+            log_interval=log_interval,
             reset_num_timesteps=False,
         )
     if model.num_timesteps < spec.n_updates:
+        if model.num_timesteps % log_interval:  # what was measured since the last row is in no checkpoint
+            model.dump_logs()
         model.save(folder / "checkpoint.zip")
         raise StoppedError(f"{spec.name} was ended after {model.num_timesteps:,} updates", where=str(folder))
     seconds = seconds_before + time.monotonic() - started
@@ -344,10 +348,9 @@ def _changed_hyperparameters(spec: RunSpec, config: dict[str, Any]) -> list[str]
     """What a changed row of the hyperparameter file, or a default of another version, would make of the run."""
     there = config.get("hyperparameters")
     there = there if isinstance(there, dict) else {}
-    data = find_file(spec.dataset)[1]
-    in_force = {**defaults_of(spec.algo), **row_of(spec.algo, None if data is None else data.id), **spec.overrides}
+    row = config["dataset"].get("row", catalogue_id(config["dataset"].get("name")))
     changes = []
-    for name, value in in_force.items():
+    for name, value in settings_in_force(spec.algo, row, spec.overrides).items():
         # networks are told by the row or by none; a schedule is a function, which has no value to compare
         if name in NOT_HYPERPARAMETERS or name not in there or callable(value) or (name == "policy_kwargs" and not value):
             continue
@@ -481,13 +484,16 @@ def write_config(
     :param n_members: of the population it is trained in
     """
     assert model.dataset is not None
-    path, _ = find_file(model.dataset)
+    path, known = find_file(model.dataset)
+    # the row that it began with, whatever the file is called by now
+    before = (read_config(folder) or {}).get("dataset", {})
+    row = before.get("row", None if known is None else known.id)
     device = device or model.device
     hyperparameters = {name: _plain(value) for name, value in model.hyperparameters().items()}
     config = {
         "run": _config(spec),
         "command": " ".join(["sb3-dce", *sys.argv[1:]]) if Path(sys.argv[0]).name == "sb3-dce" else None,
-        "dataset": {"name": model.dataset, "sha256": sha256_once(path), **(model.dataset_statistics or {})},
+        "dataset": {"name": model.dataset, "row": row, "sha256": sha256_once(path), **(model.dataset_statistics or {})},
         "hyperparameters": hyperparameters,
         "versions": {
             "sb3_dce": sb3_dce.__version__,

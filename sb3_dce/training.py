@@ -22,10 +22,10 @@ from sb3_dce.envs import make_env, missing_simulator
 from sb3_dce.errors import CheckpointError, ConfigError
 from sb3_dce.evaluation import Evaluation, evaluate, read_evaluations
 from sb3_dce.files import quoted
-from sb3_dce.launch import launch_all
+from sb3_dce.launch import launch_all, raise_first
 from sb3_dce.plots import plot_learning_curves
 from sb3_dce.rollouts import Rollouts, rollouts_of
-from sb3_dce.runs import RunSpec, check_before_running
+from sb3_dce.runs import RunSpec, check_before_running, read_config
 from sb3_dce.saving import existing_zip, saved_algo
 
 
@@ -63,8 +63,6 @@ def train_seeds(
     path, spec = find_file(dataset)
     row = hyperparams.load_row(algo, None if spec is None else spec.id)
     total = n_updates or hyperparams.split_row(row).n_timesteps
-    if rollouts_of(dataset, n_eval_episodes) is not None:
-        check_ends_with_evaluation(total, eval_freq)
     name = short_name(dataset)
     folder = out or Path("runs") / f"{algo}-{name}"
     where = f"[b]{escape(name)}[/b] ({escape(str(path))})"
@@ -73,12 +71,15 @@ def train_seeds(
         RunSpec(algo, dataset, seed, total, str(folder / f"seed_{seed}"), eval_freq, n_eval_episodes, overrides)
         for seed in seeds
     ]
+    # a run of an earlier version may have been begun without this check
+    if rollouts_of(dataset, n_eval_episodes) is not None and any(read_config(Path(s.folder)) is None for s in specs):
+        check_ends_with_evaluation(total, eval_freq)
     check_before_running(specs)
     outcomes = launch_all(specs, workers, console)
     errors = [outcome for outcome in outcomes if isinstance(outcome, BaseException)]
     results = [outcome for outcome in outcomes if not isinstance(outcome, BaseException)]
     if not results:
-        raise errors[0]
+        raise_first(errors, console)
     show_results({algo: results}, console)
     curves = {algo: [read_evaluations(Path(s.folder), None if spec is None else spec.id) for s in specs]}
     picture = plot_learning_curves(curves, folder / "learning_curve.png", title=name)
@@ -89,10 +90,7 @@ def train_seeds(
     needs = "" if evaluated else " --env <id of its environment>"
     model = quoted(f"{folder}/seed_{results[0]['config']['seed']}/model.zip")
     console.print(f"next   sb3-dce evaluate {model}{needs}", markup=False, soft_wrap=True)
-    for error in errors[1:]:
-        console.print(f"failed: {error}", markup=False, soft_wrap=True)
-    if errors:
-        raise errors[0]
+    raise_first(errors, console)
     return results
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,11 @@ import yaml
 from commands import sb3_dce
 from update_tools import all_tensors, largest_difference
 
-from sb3_dce import OfflineDCE, runs
+from sb3_dce import OfflineDCE, OfflineIQL, configuration, runs
+from sb3_dce.data import find_file
 from sb3_dce.errors import ConfigError
+from sb3_dce.evaluation import read_evaluations
 from sb3_dce.experiments import results
-from sb3_dce.launch import SAVING_SECONDS
 from sb3_dce.runs import RunSpec, StoppedError, check_before_running, read_result, run
 from sb3_dce.saving import saved_timesteps
 
@@ -50,7 +52,30 @@ def test_run_that_is_told_to_end_saves_and_goes_on_to_the_same_end(tmp_path: Pat
     models = [OfflineDCE.load(tmp_path / name / "model.zip") for name in ("parts", "whole")]
     assert largest_difference(*map(all_tensors, models)) == 0
     steps = [list(results.read_log(tmp_path / name).index) for name in ("parts", "whole")]
-    assert steps[0] == steps[1] == [10, 20, 30]
+    assert steps == [[10, 13, 17, 20, 30], [10, 20, 30]]
+
+
+def test_run_is_not_ended_between_a_chunk_of_updates_and_its_evaluation(tmp_path: Path) -> None:
+    with pytest.raises(StoppedError):
+        run(spec(tmp_path, 30, gradient_steps=5), stop=after(2))
+    assert saved_timesteps(tmp_path / "checkpoint.zip") == 10
+    assert run(spec(tmp_path, 30, gradient_steps=5), stop=after(4))["evaluated_at"] == 30, "the last update is the last"
+    assert [e.n_updates for e in read_evaluations(tmp_path, TINY)] == [10, 20, 30]
+
+
+def test_run_keeps_its_row_when_the_file_is_called_otherwise(tmp_path: Path) -> None:
+    begun, moved = tmp_path / "halfcheetah-medium-sb3.hdf5", tmp_path / "moved.hdf5"
+    shutil.copy(find_file(TINY)[0], begun)
+
+    def iql(path: Path, n_updates: int) -> RunSpec:
+        settings = {**SMALL, "actor_lr_schedule": "constant"}
+        return RunSpec("offline_iql", str(path), 0, n_updates, str(tmp_path / "run"), 10, 1, settings)
+
+    run(iql(begun, 10))
+    begun.rename(moved)
+    for n_updates in (20, 30):
+        run(iql(moved, n_updates))
+    assert OfflineIQL.load(tmp_path / "run" / "model.zip").reward_normalization == "iql", "as that row has it"
 
 
 def test_interrupted_run_is_not_made_shorter_than_it_is(tmp_path: Path) -> None:
@@ -63,8 +88,8 @@ def test_interrupted_run_is_not_made_shorter_than_it_is(tmp_path: Path) -> None:
 
 def test_changed_row_of_the_hyperparameter_file_makes_another_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run(spec(tmp_path, 10))
-    row = runs.row_of("dce", TINY)
-    monkeypatch.setattr(runs, "row_of", lambda algo, dataset_id: {**row, "beta": 3.0})
+    row = configuration.row_of("dce", TINY)
+    monkeypatch.setattr(configuration, "row_of", lambda algo, dataset_id: {**row, "beta": 3.0})
     with pytest.raises(ConfigError, match=r"beta=4\.0 there, 3\.0 now, by the hyperparameter file"):
         run(spec(tmp_path, 20))
     run(spec(tmp_path / "other", 10))
@@ -108,32 +133,45 @@ def test_seed_that_diverges_ends_no_other(tmp_path: Path) -> None:
     assert read_result(tmp_path / "seed_1") is not None and "seed_1/model.zip" in outcome.stdout
 
 
-def begin(command: list[str], folder: Path, ready: str) -> subprocess.Popen[str]:
-    """A command in a process of its own, once files of this pattern are in the folder."""
-    arguments = [sys.executable, "-c", "from sb3_dce.cli import main; main()", *command, *FAST, "--out", str(folder)]
-    process = subprocess.Popen(arguments, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 200
-    while not list(folder.rglob(ready)) and time.monotonic() < deadline and process.poll() is None:
-        time.sleep(0.02)
-    return process
+@pytest.fixture
+def begin() -> Iterator[Callable[[list[str], Path, str], subprocess.Popen[str]]]:
+    """Starts a command in a group of processes of its own, and waits for files of a pattern in its folder."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start(command: list[str], folder: Path, ready: str) -> subprocess.Popen[str]:
+        arguments = [sys.executable, "-c", "from sb3_dce.cli import main; main()", *command, *FAST, "--out", str(folder)]
+        pipes = {"stderr": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        process = subprocess.Popen(arguments, start_new_session=True, **pipes)  # type: ignore[call-overload]
+        started.append(process)
+        deadline = time.monotonic() + 150
+        while not list(folder.rglob(ready)) and time.monotonic() < deadline and process.poll() is None:
+            time.sleep(0.02)
+        return process
+
+    yield start
+    for process in started:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no such signals")
 @pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
-def test_interrupted_command_saves_where_it_is_and_goes_on(sent: signal.Signals, tmp_path: Path) -> None:
+def test_interrupted_command_saves_where_it_is_and_goes_on(sent: signal.Signals, tmp_path: Path, begin: Any) -> None:
     command = ["train", TINY, "--updates", "1000000", "--eval-freq", "200000", "--eval-episodes", "1"]
     process = begin(command, tmp_path, "progress_0.csv")
     time.sleep(1)
-    process.send_signal(sent)
-    stdout, stderr = process.communicate(timeout=SAVING_SECONDS)
+    os.killpg(process.pid, sent)  # a terminal, a batch system and `timeout` send it to all of the group
+    if sent == signal.SIGTERM:
+        process.send_signal(sent)
+    stdout, stderr = process.communicate(timeout=100)
     assert process.returncode == 130 and stderr == ""
     assert "saving what is being trained" in stdout and "The same command goes on from there." in stdout
     done = saved_timesteps(tmp_path / "seed_0" / "checkpoint.zip")
     assert 0 < done < 1_000_000 and done % 200_000
     config = yaml.safe_load((tmp_path / "seed_0" / "config.yml").read_text())
-    again = RunSpec(**{**config["run"], "n_updates": 200_000}, folder=str(tmp_path / "seed_0"))
     with pytest.raises(StoppedError):
-        run(again, stop=after(2))
+        run(RunSpec(**config["run"], folder=str(tmp_path / "seed_0")), stop=after(2))
     assert saved_timesteps(tmp_path / "seed_0" / "checkpoint.zip") == done + 2
 
 
@@ -151,11 +189,11 @@ def children_of(pid: int) -> list[int]:
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds the processes in /proc")
-def test_process_that_is_killed_takes_no_other_run_with_it(tmp_path: Path) -> None:
+def test_process_that_is_killed_takes_no_other_run_with_it(tmp_path: Path, begin: Any) -> None:
     lengths = ["--updates", "20", "--updates-of", "dce=1e6", "--eval-freq", "20", "--eval-episodes", "1", "--workers", "1"]
     process = begin(["compare", "--dataset", TINY, "--algos", "dce,bc", "--seeds", "1", *lengths], tmp_path, "checkpoint.zip")
     os.kill(children_of(process.pid)[0], signal.SIGKILL)
-    stdout, stderr = process.communicate(timeout=120)
+    stdout, stderr = process.communicate(timeout=100)
     assert process.returncode == 2 and "Traceback" not in stderr
     assert "the process of dce seed 0 was ended from outside" in stderr and "fewer --workers" in stderr
     assert "offline_bc" in stdout and (tmp_path / "comparison.md").is_file()

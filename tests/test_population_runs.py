@@ -20,6 +20,7 @@ from sb3_dce import OfflineDCE
 from sb3_dce.errors import ConfigError, DivergenceError
 from sb3_dce.evaluation import read_evaluations
 from sb3_dce.evaluation_pool import EvaluationPool
+from sb3_dce.population import Population
 from sb3_dce.population_runs import STATE_FILE, BatchedRuns, train_population
 from sb3_dce.runs import RunSpec, read_divergence, run
 
@@ -120,6 +121,28 @@ def test_population_goes_on_without_the_member_that_diverged(tmp_path: Path, mon
     assert one._n_updates == other._n_updates == specs(tmp_path)[0].n_updates
     assert largest_difference(all_tensors(one), all_tensors(other)) == 0.0
     assert not list(tmp_path.rglob("checkpoint_*")) and not (tmp_path / "killed" / STATE_FILE).exists()
+
+
+@pytest.mark.parametrize("n_before", [13, 20])  # in the middle, and before the evaluation that is due
+def test_interrupted_population_saves_where_it_is(n_before: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    original = Population.train
+
+    def interrupted(self: Population, n_updates: int, total: int | None = None) -> None:
+        original(self, min(n_updates, n_before - self.n_updates), total)
+        if self.n_updates == n_before:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Population, "train", interrupted)
+        batched(tmp_path / "parts").run()
+    assert (tmp_path / "parts" / "seed_1" / f"checkpoint_{n_before}.zip").exists()
+    parts, whole = batched(tmp_path / "parts").run(), batched(tmp_path / "whole").run()
+    assert [result["returns"] for result in parts] == [result["returns"] for result in whole]
+    for seed in range(2):
+        one, other = (OfflineDCE.load(tmp_path / kind / f"seed_{seed}" / "model.zip") for kind in ("parts", "whole"))
+        assert largest_difference(all_tensors(one), all_tensors(other)) == 0.0
+        evaluated = [read_evaluations(tmp_path / kind / f"seed_{seed}", TINY) for kind in ("parts", "whole")]
+        assert evaluated[0] == evaluated[1]
 
 
 def test_population_ends_when_all_have_diverged(tmp_path: Path) -> None:

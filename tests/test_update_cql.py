@@ -251,7 +251,7 @@ def test_cloning_at_the_start_compiles_twice_and_not_per_step(transitions: Trans
 @pytest.mark.slow
 @needs_compiler
 def test_update_with_rounded_products_is_compiled(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sb3_dce.precision._missing", lambda precision, device: None)
+    monkeypatch.setattr("sb3_dce.precision.missing_for", lambda precision, device: None)
     monkeypatch.setattr("sb3_dce.precision._rounds_itself", lambda: False)
     settings = {"n_actions": 2, "policy_kwargs": {"net_arch": [32]}, "precision": "bf16-matmul", "execution": "compile"}
     model = make_model(transitions, **settings)

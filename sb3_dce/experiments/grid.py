@@ -19,9 +19,9 @@ from typing import Any
 
 import yaml
 
-from sb3_dce import hyperparams
+from sb3_dce import configuration, hyperparams
 from sb3_dce.agents import agent_class
-from sb3_dce.configuration import config_hash, defaults_of, differences, row_of
+from sb3_dce.configuration import config_hash, differences
 from sb3_dce.data.catalog import resolve
 from sb3_dce.data.locate import known_dataset, search
 from sb3_dce.errors import ConfigError, DatasetNotFoundError
@@ -298,7 +298,7 @@ def settings_in_force(variant: Variant, dataset_id: str, scale: Scale | None = N
     :param scale: adds its own arguments
     :return: every argument of the agent's constructor
     """
-    return {**defaults_of(variant.algo), **row_of(variant.algo, dataset_id), **_overrides(variant, scale)}
+    return configuration.settings_in_force(variant.algo, dataset_id, _overrides(variant, scale))
 
 
 def source_of(dataset_id: str) -> str:

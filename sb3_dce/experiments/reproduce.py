@@ -39,6 +39,7 @@ from sb3_dce.experiments.run import execute, is_complete
 from sb3_dce.experiments.tables import parts_of
 from sb3_dce.files import check_writable
 from sb3_dce.hyperparams import did_you_mean, full_name
+from sb3_dce.launch import raise_first
 from sb3_dce.precision import PRECISIONS, missing_for
 from sb3_dce.runs import RunSpec, read_config, refuse_other_run
 from sb3_dce.sb3_checks import check_device
@@ -145,10 +146,7 @@ def reproduce(request: Request, console: Console) -> dict[str, Report]:
     if request.page is not None:
         write_page(request.page, request.out, evidences, reports, _command(request))
         console.print(f"page   {request.page}", markup=False)
-    for error in errors[1:]:
-        console.print(f"failed: {error}", markup=False, soft_wrap=True)
-    if errors:  # what is complete has been kept and shown
-        raise errors[0]
+    raise_first(errors, console)
     return reports
 
 
@@ -161,7 +159,7 @@ def _check_request(request: Request) -> None:
     check_choice("--precision", request.precision, PRECISIONS)
     check_device(request.device)
     lacking = missing_for(request.precision, get_device(request.device))
-    if lacking is not None and request.ray_address is None:
+    if lacking is not None and request.ray_address is None and not request.report_only:
         hint = "Leave it out: float32 runs everywhere."
         raise ConfigError(f"--precision {request.precision} needs {lacking}", key="--precision", hint=hint)
     if request.report_only and (request.datasets or request.agents or request.seeds or request.first_seed):

@@ -17,7 +17,7 @@ from stable_baselines3.common.utils import get_device
 from sb3_dce.agents import agent_class
 from sb3_dce.configuration import row_of
 from sb3_dce.data.catalog import resolve
-from sb3_dce.errors import DivergenceError
+from sb3_dce.errors import DivergenceError, SB3DCEError
 from sb3_dce.experiments.grid import PlannedRun
 from sb3_dce.experiments.probe import prepare_probe
 from sb3_dce.launch import launch_all
@@ -64,11 +64,16 @@ def execute(
         DivergenceError(f"the probe needs the last policy of {path.name}, which diverged", hint=hint) for path in without
     ]
     # where the run that is needed has failed otherwise, its own error says why
-    after = [(spec, path) for spec, path in after if path not in without and (not failures or read_result(path) is not None)]
+    prepared = []
     for spec, best_policy in after:
-        prepare_probe(spec, best_policy)
+        if best_policy not in without and read_result(best_policy) is not None:
+            try:
+                prepare_probe(spec, best_policy)
+                prepared.append(spec)
+            except SB3DCEError as error:
+                failures.append(error)
     # A probe begins from a file on this machine, and is one model with five sets of critics: never batched.
-    failures += _run_all([spec for spec, _ in after], workers, th.device("cpu"), None, console)
+    failures += _run_all(prepared, workers, th.device("cpu"), None, console)
     diverged = [str(error) for error in failures if isinstance(error, DivergenceError)]
     return diverged, [error for error in failures if not isinstance(error, DivergenceError)]
 
