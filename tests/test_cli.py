@@ -181,6 +181,8 @@ def test_an_interrupted_run_goes_on_and_ends_like_an_uninterrupted_one(tmp_path:
         (("reproduce", "table1", "--report-only", "--agents", "BC"), ("trains nothing", "leave out")),
         (("reproduce", "table1", "--reuse", "."), ("no result rows in the folder", "--import")),
         (("reproduce", "table1", "--import", "."), ("no runs below the folder",)),
+        (("reproduce", "table1", "--page", "."), ("a folder is no file", "results.md")),
+        (("reproduce", "table1", "--precision", "tf32", "--device", "cpu"), ("tf32 needs", "Leave it out")),
         (("evaluate", "missing.zip"), ("no such file",)),
         (("datasets", "info", "nonsense"), ("nonsense",)),
     ],
@@ -193,6 +195,19 @@ def test_user_errors_are_one_clear_message(
     assert list(tmp_path.iterdir()) == []
     for word in words:
         assert word in message
+
+
+def test_what_nobody_foresaw_is_a_message_and_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("out of memory, says [the device]")
+
+    monkeypatch.setattr("sb3_dce.training.evaluate_file", fail)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    outcome = sb3_dce("evaluate", "model.zip")
+    assert outcome.code == 1 and "Traceback" not in outcome.stderr
+    assert outcome.stderr.startswith("Error: RuntimeError: out of memory, says [the device]")
+    (report,) = tmp_path.iterdir()
+    assert str(report) in outcome.stderr and "Traceback" in report.read_text()
 
 
 @pytest.mark.parametrize("command", [("reproduce", "config-tables"), ("compare", "--dataset", TINY, "--updates", "4")])
