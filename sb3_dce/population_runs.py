@@ -18,7 +18,7 @@ import numpy as np
 import torch as th
 from rich.console import Console
 from rich.progress import Progress, TaskID
-from stable_baselines3.common.logger import Logger, make_output_format
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import get_device
 
 from sb3_dce.agents import agent_class
@@ -32,7 +32,16 @@ from sb3_dce.launch import launch, progress_display, show_evaluation
 from sb3_dce.population import Population
 from sb3_dce.processes import termination_as_interrupt, usable_cores
 from sb3_dce.rollouts import Rollouts, rollouts_of
-from sb3_dce.runs import RunSpec, alone, read_result, refuse_other_run, write_config, write_divergence, write_result
+from sb3_dce.runs import (
+    RunSpec,
+    alone,
+    make_logger,
+    read_result,
+    refuse_other_run,
+    write_config,
+    write_divergence,
+    write_result,
+)
 
 # Beside the members' folders: how far all have come, and the state of the common random generator.
 STATE_FILE = "population.pt"
@@ -200,7 +209,7 @@ class BatchedRuns:
         for spec, model, folder in zip(self.specs, models, self.folders, strict=True):
             folder.mkdir(parents=True, exist_ok=True)
             write_config(spec, model, folder, self._device, len(models))
-            self._loggers.append(Logger(str(folder), [make_output_format("csv", str(folder), f"_{population.n_updates}")]))
+            self._loggers.append(make_logger(spec, model, folder))
         return population
 
     def _say_memory(self, population: Population) -> None:
@@ -216,7 +225,8 @@ class BatchedRuns:
         for index, (metrics, logger) in enumerate(zip(population.read_metrics(), self._loggers, strict=True)):
             for name, value in metrics.items():
                 logger.record(f"train/{name}", value)
-            logger.record("time/total_timesteps", population.n_updates)  # a row of the file says where it belongs
+            # a row of the file says where it belongs
+            logger.record("time/total_timesteps", population.n_updates, exclude="tensorboard")
             logger.dump(population.n_updates)
             if index not in self._diverged and not np.isfinite(list(metrics.values())).all():
                 self._diverged[index] = population.n_updates

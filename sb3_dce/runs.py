@@ -179,11 +179,7 @@ def _train(spec: RunSpec, model: OfflineAlgorithm, folder: Path, report: Report,
     dataset_id = catalogue_id(model.dataset)
     write_config(spec, model, folder)
     _forget_logs_after(folder, model.num_timesteps)
-    formats = [make_output_format("csv", str(folder), f"_{model.num_timesteps}")]
-    if model.tensorboard_log is not None:
-        name = f"{spec.algo}_{short_name(spec.dataset)}_{spec.seed}"
-        formats.append(make_output_format("tensorboard", str(Path(model.tensorboard_log) / name)))
-    model.set_logger(Logger(str(folder), formats))
+    model.set_logger(make_logger(spec, model, folder))
 
     def on_evaluation(outcome: Evaluation) -> None:
         report(Progress(spec.name, model.num_timesteps, spec.n_updates, outcome))
@@ -213,6 +209,20 @@ def _train(spec: RunSpec, model: OfflineAlgorithm, folder: Path, report: Report,
     result = write_result(spec, folder, evaluating.evaluations, seconds)
     (folder / "checkpoint.zip").unlink(missing_ok=True)
     return result
+
+
+def make_logger(spec: RunSpec, model: OfflineAlgorithm, folder: Path) -> Logger:
+    """
+    :param spec: what is run
+    :param model: its model, at the update from which it goes on
+    :param folder: where it is written
+    :return: logger to a file of this beginning and, if the model asks for it, to TensorBoard
+    """
+    formats = [make_output_format("csv", str(folder), f"_{model.num_timesteps}")]
+    if model.tensorboard_log is not None:
+        name = f"{spec.algo}_{short_name(spec.dataset)}_{spec.seed}"
+        formats.append(make_output_format("tensorboard", str(Path(model.tensorboard_log) / name)))
+    return Logger(str(folder), formats)
 
 
 def write_result(spec: RunSpec, folder: Path, evaluations: list[Evaluation], seconds: float) -> dict[str, Any]:

@@ -123,6 +123,14 @@ def test_population_goes_on_without_the_member_that_diverged(tmp_path: Path, mon
     assert not list(tmp_path.rglob("checkpoint_*")) and not (tmp_path / "killed" / STATE_FILE).exists()
 
 
+def test_members_write_tensorboard_logs_of_their_own(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    batched(tmp_path / "runs", n_updates=20, tensorboard_log=str(tmp_path / "tb")).run()
+    names = [f"dce_{TINY}_{seed}" for seed in range(2)]
+    assert sorted(path.name for path in (tmp_path / "tb").iterdir()) == names
+    assert all(list((tmp_path / "tb" / name).glob("events.*")) for name in names)
+
+
 @pytest.mark.parametrize("n_before", [13, 20])  # in the middle, and before the evaluation that is due
 def test_interrupted_population_saves_where_it_is(n_before: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     original = Population.train
