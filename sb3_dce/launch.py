@@ -146,6 +146,7 @@ class _Workers:
             self._ended = True
         for process in self._processes if at_once else ():
             process.kill()  # they do not listen to SIGTERM
+            process.join()  # before its pipe is closed, at which a thread may be waiting
         for end in self._ends:
             end.close()
         for process in self._processes:
