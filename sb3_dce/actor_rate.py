@@ -18,7 +18,7 @@ class ActorLearningRate:
         :raises ConfigError: if a parameter is out of its range
         """
         super().check_parameters()  # type: ignore[misc]
-        check_optional("actor_learning_rate", self.actor_learning_rate, hint="None takes learning_rate.")
+        check_optional("actor_learning_rate", self.actor_learning_rate, 0, open_low=True, hint="None takes learning_rate.")
 
     def learning_rates(self) -> dict[str, float]:
         """

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.bc import OfflineBC
+from sb3_dce.checks import did_you_mean
 from sb3_dce.cql import OfflineCQL
 from sb3_dce.dce import OfflineDCE
 from sb3_dce.dce_probe import OfflineDCEProbe
 from sb3_dce.dce_variants import OfflineCQLEq18, OfflineSACV
 from sb3_dce.errors import ConfigError
-from sb3_dce.hyperparams import did_you_mean
 from sb3_dce.iql import OfflineIQL
 from sb3_dce.pbrl import OfflinePBRL
 from sb3_dce.sac import OfflineSAC

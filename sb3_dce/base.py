@@ -255,7 +255,7 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         check_flags(self)
         check_number("batch_size", self.batch_size, 1, integer=True)
         check_number("gradient_steps", self.gradient_steps, 1, integer=True)
-        check_optional("max_grad_norm", self.max_grad_norm)
+        check_optional("max_grad_norm", self.max_grad_norm, 0, open_low=True)
         check_number("tau", self.tau, 0, 1, hint="Usual is 0.005. The paper's tau is the expectile.")
         check_number("gamma", self.gamma, 0, 1)
         check_number("reward_scale", self.reward_scale, 0, open_low=True)

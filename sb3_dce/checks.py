@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
 from numbers import Integral, Real
 from typing import Any
 
@@ -41,15 +43,17 @@ def check_number(
         raise ConfigError(f"{name} must be {kind} in {interval}, got {value!r}", key=name, hint=hint)
 
 
-def check_optional(name: str, value: Any, hint: str | None = None) -> None:
+def check_optional(name: str, value: Any, low: float, *, hint: str = "None switches it off.", **limits: Any) -> None:
     """
-    :param name: name of a parameter that is ``None`` (off) or a positive number
+    :param name: name of a parameter that may be ``None``
     :param value: what the user gave
+    :param low: smallest allowed number
     :param hint: what to do
-    :raises ConfigError: if it is neither
+    :param limits: as for :func:`check_number`
+    :raises ConfigError: if it is neither ``None`` nor an allowed number
     """
     if value is not None:
-        check_number(name, value, 0, open_low=True, hint=hint or "None switches it off.")
+        check_number(name, value, low, hint=hint, **limits)
 
 
 def check_choice(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
@@ -100,6 +104,16 @@ def check_widths(name: str, value: Any, hint: str = "For example [256, 256].") -
     ok = isinstance(value, (list, tuple))
     if not ok or any(isinstance(n, bool) or not isinstance(n, Integral) or n < 1 for n in value):
         raise ConfigError(f"{name} must be a list of numbers of units, got {value!r}", key=name, hint=hint)
+
+
+def did_you_mean(name: str, candidates: Iterable[str]) -> str:
+    """
+    :param name: what the user wrote
+    :param candidates: what is allowed
+    :return: "Did you mean '...'? " with the closest candidate, or an empty string
+    """
+    close = difflib.get_close_matches(name, list(candidates), n=1)
+    return f"Did you mean {close[0]!r}? " if close else ""
 
 
 def check_ends_with_evaluation(n_updates: int, eval_freq: int, whose: str = "") -> None:

@@ -14,7 +14,7 @@ import yaml
 from rich.console import Console
 
 from sb3_dce import cli_datasets
-from sb3_dce.checks import LAST_SEED
+from sb3_dce.checks import LAST_SEED, check_steps
 from sb3_dce.cli_datasets import DatasetArgument
 from sb3_dce.errors import ConfigError, SB3DCEError
 from sb3_dce.messages import show_warnings_as_lines
@@ -269,9 +269,7 @@ def _parse_overrides(pairs: list[str]) -> dict[str, Any]:
 
 def _steps(updates: float) -> int:
     """Gradient steps are written as 1e6, too, and so arrive as a float."""
-    if not updates.is_integer():  # nor are infinity and NaN
-        raise ConfigError(f"--updates must be a whole number, got {updates:g}", key="--updates", hint="For example 1e5.")
-    return int(updates)
+    return check_steps("--updates", updates)
 
 
 def _parse_lengths(pairs: list[str]) -> dict[str, int]:
@@ -279,14 +277,13 @@ def _parse_lengths(pairs: list[str]) -> dict[str, int]:
     for pair in pairs:
         name, _, text = pair.partition("=")
         try:
-            length = float(text)
+            lengths[name] = check_steps("--updates-of", float(text))
         except ValueError:
-            length = 0.0
-        if not name or length < 1 or not length.is_integer():
+            lengths[name] = 0
+        if not name or lengths[name] < 1:
             hint = "For example --updates-of pbrl=1e4."
             message = f"--updates-of wants AGENT=UPDATES, a whole number of these, got {pair!r}"
             raise ConfigError(message, key="--updates-of", hint=hint)
-        lengths[name] = int(length)
     return lengths
 
 

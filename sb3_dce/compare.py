@@ -27,6 +27,7 @@ from sb3_dce.hyperparams import check_keys, full_name
 from sb3_dce.launch import launch_all, raise_first
 from sb3_dce.plots import plot_learning_curves
 from sb3_dce.runs import RunSpec, check_before_running, last_metrics, read_divergence, read_result
+from sb3_dce.student import sample_std
 
 BANDS = (
     "Thick: mean over seeds; thin: each seed; bands: 95 % confidence interval of the mean (Student's t) from three seeds on, "
@@ -225,7 +226,7 @@ def _row(algo: str, runs: dict[Path, dict[str, Any]], scored: bool) -> Row:
     folders, results = list(runs), list(runs.values())
     values = [r["normalized_score"] if scored else r["mean_return"] for r in results]
     known = np.array([np.nan if value is None else value for value in values], dtype=float)
-    std = float(known.std(ddof=1)) if len(known) > 1 else float("nan")
+    std = float(sample_std(known))
     seconds = float(np.mean([1000 * r["seconds"] / r["n_updates"] for r in results]))
     overrides = results[0]["config"].get("overrides", {})
     logged = [last_metrics(folder) for folder in folders]

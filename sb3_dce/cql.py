@@ -15,7 +15,7 @@ from sb3_dce import losses
 from sb3_dce.actor_rate import ActorLearningRate
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
-from sb3_dce.checks import check_choice, check_number
+from sb3_dce.checks import check_choice, check_number, check_optional
 from sb3_dce.ensembles import EnsembleNet
 from sb3_dce.entropy import EntropyCoefficient, stepped_ent_coef
 from sb3_dce.execution import Update, UpdateOptions, bound_update
@@ -161,8 +161,7 @@ class OfflineCQL(ActorLearningRate, ActorWarmUp, EntropyCoefficient, OfflineAlgo
         super().check_parameters()
         check_number("cql_weight", self.cql_weight, 0, hint="The authors use 5 or 10; 1 with a Lagrange multiplier.")
         check_number("n_actions", self.n_actions, 1, integer=True)
-        if self.lagrange_threshold is not None:
-            check_number("lagrange_threshold", self.lagrange_threshold, 0, hint="None switches it off.")
+        check_optional("lagrange_threshold", self.lagrange_threshold, 0)
         check_choice("lagrange_form", self.lagrange_form, LAGRANGE_FORMS)
 
     def policy_settings(self) -> dict[str, Any]:

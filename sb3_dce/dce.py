@@ -95,7 +95,7 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
     """
 
     algo_name: ClassVar[str] = "dce"
-    networks = ("actor", "critic", "critic_target", "value_net", "value_net_target")
+    networks: ClassVar[tuple[str, ...]] = ("actor", "critic", "critic_target", "value_net", "value_net_target")
     population_scalars = frozenset(
         {
             *("expectile", "td_loss_coef"),
@@ -218,17 +218,15 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
         super().check_parameters()
         check_number("expectile", self.expectile, 0, 1, open_low=True, open_high=True, hint="The paper uses 0.7.")
         check_number("beta", self.beta, 0, hint="0 is SAC with V; the paper's values are in zoo_hyperparams/dce.yml.")
-        if self.beta_final is not None:
-            check_number("beta_final", self.beta_final, 0, hint="None keeps beta constant.")
+        check_optional("beta_final", self.beta_final, 0, hint="None keeps beta constant.")
         check_number("beta_rate", self.beta_rate, -float("inf"), open_low=True, hint="0 keeps beta constant.")
         check_number("td_loss_coef", self.td_loss_coef, 0, open_low=True, hint="The paper's Eq. 6 is 1.")
         check_number("critic_dropout", self.critic_dropout, 0, 1, open_high=True, hint="The paper uses 0.1 on human data.")
         for name in ("beta_update_every", "steps_per_epoch", "n_penalty_actions", "policy_update_freq"):
             check_number(name, getattr(self, name), 1, integer=True)
         check_number("critic_weight_decay", self.critic_weight_decay, 0)
-        if self.penalty_floor is not None:
-            check_number("penalty_floor", self.penalty_floor, -float("inf"), open_low=True, hint="None switches it off.")
-        check_optional("q_target_clip", self.q_target_clip)
+        check_optional("penalty_floor", self.penalty_floor, -float("inf"), open_low=True)
+        check_optional("q_target_clip", self.q_target_clip, 0, open_low=True)
         check_choice("penalty_action_source", self.penalty_action_source, PENALTY_SOURCES)
         check_choice("penalty_form", self.penalty_form, PENALTY_FORMS)
         check_choice("v_target_reduction", self.v_target_reduction, REDUCTIONS)

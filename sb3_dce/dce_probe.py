@@ -47,8 +47,7 @@ class ProbePolicy(OfflineSACPolicy):
             for network, made in zip(TRAINED, (self.make_critic(), self.make_critic(), self.make_value_net()), strict=True):
                 copy = self._add(probe_name(network, beta), made, getattr(self, network))
                 if network != "critic_target":
-                    rate = lr_schedule(1)
-                    copy.optimizer = self.optimizer_class(copy.parameters(), lr=rate, **self.optimizer_kwargs)  # type: ignore
+                    copy.optimizer = self.make_optimizer(copy, lr_schedule)  # type: ignore[assignment]
 
     def _add(self, name: str, network: nn.Module, original: nn.Module) -> nn.Module:
         network.load_state_dict(original.state_dict())
@@ -70,7 +69,7 @@ class OfflineDCEProbe(OfflineDCE):
     """
 
     algo_name: ClassVar[str] = "dce_probe"
-    networks: ClassVar[tuple[str, ...]] = (  # type: ignore[assignment]
+    networks = (
         *OfflineDCE.networks,
         *(f"actor_{name}" for name in PROBE_POLICIES),
         *(f"{network}_beta{beta}" for beta in PROBE_BETAS for network in ("critic", "critic_target", "value_net")),

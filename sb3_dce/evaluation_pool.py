@@ -23,7 +23,7 @@ from stable_baselines3.common.policies import BasePolicy
 from sb3_dce.checks import check_number
 from sb3_dce.errors import ConfigError, SB3DCEError
 from sb3_dce.mlp_actor import ActorSnapshot, MLPActor, actor_snapshot
-from sb3_dce.processes import prepare_worker
+from sb3_dce.processes import end_workers, prepare_worker
 from sb3_dce.rollouts import (
     Act,
     Ending,
@@ -53,12 +53,6 @@ class PendingEpisodes:
 
     def __init__(self, parts: Sequence[Future[list[Ending]]]) -> None:
         self._parts = parts
-
-    def done(self) -> bool:
-        """
-        :return: whether :meth:`result` returns at once
-        """
-        return all(part.done() for part in self._parts)
 
     def result(self) -> Episodes:
         """
@@ -136,11 +130,8 @@ class EvaluationPool:
     def close(self) -> None:
         """End the workers; what they are at is lost."""
         executor, self._executor = self._executor, None
-        if executor is None:
-            return
-        for process in list(executor._processes.values()):
-            process.terminate()
-        executor.shutdown(wait=True, cancel_futures=True)
+        if executor is not None:
+            end_workers(executor)
 
     def __enter__(self) -> EvaluationPool:
         return self

@@ -6,7 +6,6 @@ One file per algorithm (``dce.yml``), one row per dataset id. A row holds constr
 
 from __future__ import annotations
 
-import difflib
 import inspect
 from collections.abc import Iterable
 from importlib import resources
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import yaml
 
+from sb3_dce.checks import did_you_mean
 from sb3_dce.data import catalog
 from sb3_dce.data.records import READER_OPTIONS
 from sb3_dce.errors import ConfigError
@@ -180,13 +180,3 @@ def check_keys(cls: type, keys: Iterable[str], where: str = "hyperparameters", z
             if key in READER_OPTIONS:
                 hint = f"It belongs to the reader of data: give sb3_dce.load_dataset(<file>, {key}=...) as the dataset."
             raise ConfigError(f"{cls.__name__} has no parameter {key!r}", where=where, key=key, hint=hint)
-
-
-def did_you_mean(name: str, candidates: Iterable[str]) -> str:
-    """
-    :param name: what the user wrote
-    :param candidates: what is allowed
-    :return: "Did you mean '...'? " with the closest candidate, or an empty string
-    """
-    close = difflib.get_close_matches(name, list(candidates), n=1)
-    return f"Did you mean {close[0]!r}? " if close else ""

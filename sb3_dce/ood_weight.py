@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch as th
 
-from sb3_dce.checks import check_number
+from sb3_dce.checks import check_number, check_optional
 from sb3_dce.state import Storage
 
 OOD_Q = "ood_q"  # name of the recorded value in the state tree
@@ -41,8 +41,7 @@ class OODWeight:
         super().check_parameters()  # type: ignore[misc]
         for name in ("ood_weight", "ood_weight_next", "ood_weight_min"):
             check_number(name, getattr(self, name), 0)
-        if self.ood_weight_final is not None:
-            check_number("ood_weight_final", self.ood_weight_final, 0, hint="None is a constant weight.")
+        check_optional("ood_weight_final", self.ood_weight_final, 0, hint="None is a constant weight.")
         for name in ("ood_weight_steps", "steps_per_epoch"):
             check_number(name, getattr(self, name), 1, integer=True)
         check_number("ood_weight_decay", self.ood_weight_decay, 1, open_low=True, hint="The authors divide by 1.01.")

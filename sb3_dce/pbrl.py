@@ -14,7 +14,7 @@ from sb3_dce import losses
 from sb3_dce.actor_rate import ActorLearningRate
 from sb3_dce.attaching import DatasetLike
 from sb3_dce.base import OfflineAlgorithm
-from sb3_dce.checks import check_number
+from sb3_dce.checks import check_number, check_optional
 from sb3_dce.ensembles import EnsembleNet, EnsemblePolicy
 from sb3_dce.entropy import EntropyCoefficient, stepped_ent_coef
 from sb3_dce.execution import Update, UpdateOptions, bound_update
@@ -174,8 +174,7 @@ class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OODWeight, OfflineAlgor
         for name in ("uncertainty_coef", "prior_scale"):
             check_number(name, getattr(self, name), 0)
         check_number("n_ood_actions", self.n_ood_actions, 1, integer=True)
-        if self.pseudo_target_floor is not None:
-            check_number("pseudo_target_floor", self.pseudo_target_floor, -float("inf"), open_low=True)
+        check_optional("pseudo_target_floor", self.pseudo_target_floor, -float("inf"), open_low=True)
 
     def policy_settings(self) -> dict[str, Any]:
         return {

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from sb3_dce.evaluation import Evaluation
-from sb3_dce.student import student_quantile
+from sb3_dce.student import mean_interval
 
 # Names of more lines than this stand beside the picture.
 MOST_INSIDE = 5
@@ -49,7 +49,7 @@ def plot_learning_curves(
         label = f"{name} (mean of {len(seeds)} seeds)" if len(seeds) > 1 else name
         axes.plot(steps, values.mean(axis=0), color=color, linewidth=2.0, label=label)
         if len(seeds) > 1:
-            low, high = _interval(values) if confidence and len(seeds) > 2 else (values.min(axis=0), values.max(axis=0))
+            low, high = mean_interval(values) if confidence and len(seeds) > 2 else (values.min(axis=0), values.max(axis=0))
             axes.fill_between(steps, low, high, color=color, alpha=0.15, linewidth=0)
     for number, (name, level) in enumerate((levels or {}).items()):
         axes.axhline(level, color="0.3", linestyle=("--", ":", "-.")[number % 3], linewidth=1.0, label=name)
@@ -64,14 +64,6 @@ def plot_learning_curves(
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)
     return path
-
-
-def _interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds of the 95 % confidence interval of the mean over the first axis."""
-    n = len(values)
-    half = student_quantile(n - 1) * values.std(axis=0, ddof=1) / np.sqrt(n)
-    mean = values.mean(axis=0)
-    return mean - half, mean + half
 
 
 def _value(evaluation: Evaluation, scored: bool) -> float:

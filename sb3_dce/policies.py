@@ -98,11 +98,7 @@ class OfflineSACPolicy(SACPolicy):
         if not self.use_v:
             return
         self.value_net = self.make_value_net()
-        self.value_net.optimizer = self.optimizer_class(
-            self.value_net.parameters(),
-            lr=lr_schedule(1),  # type: ignore[call-arg]
-            **self.optimizer_kwargs,
-        )
+        self.value_net.optimizer = self.make_optimizer(self.value_net, lr_schedule)
         if self.use_target_v:
             self.value_net_target = self.make_value_net()
             self.value_net_target.load_state_dict(self.value_net.state_dict())
@@ -114,6 +110,14 @@ class OfflineSACPolicy(SACPolicy):
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         return OfflineCritic(**kwargs, layer_norm=self.critic_layer_norm).to(self.device)
+
+    def make_optimizer(self, network: nn.Module, lr_schedule: Schedule) -> th.optim.Optimizer:
+        """
+        :param network: whose parameters are trained
+        :param lr_schedule: learning rate as a function of the remaining progress
+        :return: optimizer of the policy's class, with its arguments
+        """
+        return self.optimizer_class(network.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
 
     @property
     def critic_arch(self) -> list[int]:
@@ -170,11 +174,7 @@ class ActorPolicy(OfflineSACPolicy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         self.actor = self.make_actor()
-        self.actor.optimizer = self.optimizer_class(
-            self.actor.parameters(),
-            lr=lr_schedule(1),  # type: ignore[call-arg]
-            **self.optimizer_kwargs,
-        )
+        self.actor.optimizer = self.make_optimizer(self.actor, lr_schedule)
 
     def set_training_mode(self, mode: bool) -> None:
         """

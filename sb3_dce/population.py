@@ -276,10 +276,10 @@ class Population:
 
     def memory(self) -> dict[str, int]:
         """
-        :return: bytes on the device: rows of the data, state of the networks, and one update's largest intermediate results
+        :return: bytes on the device: rows of the data, state of the networks
         """
         state = sum(leaf.numel() * leaf.element_size() for leaf in tree_leaves(self.state.read()))
-        return {"data": self._rows.numel() * self._rows.element_size(), "networks": state, "update": 2 * state}
+        return {"data": self._rows.numel() * self._rows.element_size(), "networks": state}
 
 
 def free_parameters(cls: type[OfflineAlgorithm]) -> frozenset[str]:

@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from types import FrameType
 
@@ -105,3 +106,14 @@ def _end_with_parent() -> None:
     assert parent is not None
     mp.connection.wait([parent.sentinel])
     os._exit(1)
+
+
+def end_workers(executor: ProcessPoolExecutor) -> None:
+    """
+    End a pool's processes at once; what they are at is lost.
+
+    :param executor: pool, which takes no more work afterwards
+    """
+    for process in list((executor._processes or {}).values()):  # shutdown alone would wait for what they are at
+        process.terminate()
+    executor.shutdown(wait=True, cancel_futures=True)

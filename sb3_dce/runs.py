@@ -30,10 +30,10 @@ from sb3_dce.configuration import NOT_HYPERPARAMETERS, settings_in_force
 from sb3_dce.data import find_file
 from sb3_dce.data.hashes import sha256_once
 from sb3_dce.data.locate import catalogue_id, short_name
-from sb3_dce.data.locking import held
 from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError, SB3DCEError
 from sb3_dce.evaluation import Evaluation, EvaluationCallback, write_evaluations
 from sb3_dce.files import cannot_write, write_text
+from sb3_dce.locking import held
 from sb3_dce.precision import missing_for
 from sb3_dce.rollouts import rollouts_of
 from sb3_dce.saving import saved_timesteps

@@ -80,7 +80,7 @@ def train_seeds(
     results = [outcome for outcome in outcomes if not isinstance(outcome, BaseException)]
     if not results:
         raise_first(errors, console)
-    show_results({algo: results}, console)
+    show_results(algo, results, console)
     curves = {algo: [read_evaluations(Path(s.folder), None if spec is None else spec.id) for s in specs]}
     picture = plot_learning_curves(curves, folder / "learning_curve.png", title=name)
     drawn = f", {picture.name}" if picture else ""
@@ -94,25 +94,25 @@ def train_seeds(
     return results
 
 
-def show_results(results: dict[str, list[dict[str, Any]]], console: Console) -> None:
+def show_results(algo: str, results: list[dict[str, Any]], console: Console) -> None:
     """
-    :param results: per agent the results of its seeds
+    :param algo: name of the agent
+    :param results: of its seeds
     :param console: where to print
     """
     table = Table(box=None, header_style="bold")
     for title in ("agent", "seed", "return (last evaluation)", "normalised score", "train s"):
         table.add_column(title, justify="left" if title == "agent" else "right")
-    for name, rows in results.items():
-        for row in rows:
-            if row["returns"] is None:
-                cells = ("no simulator", "-")
-            else:
-                score = row["normalized_score"]
-                cells = (
-                    f"{np.mean(row['returns']):.1f} ± {np.std(row['returns']):.1f}",
-                    "-" if score is None else f"{score:.1f}",
-                )
-            table.add_row(name, str(row["config"]["seed"]), *cells, f"{row['seconds']:.0f}")
+    for row in results:
+        if row["returns"] is None:
+            cells = ("no simulator", "-")
+        else:
+            score = row["normalized_score"]
+            cells = (
+                f"{np.mean(row['returns']):.1f} ± {np.std(row['returns']):.1f}",
+                "-" if score is None else f"{score:.1f}",
+            )
+        table.add_row(algo, str(row["config"]["seed"]), *cells, f"{row['seconds']:.0f}")
     console.print(table)
 
 

@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from sb3_dce.policies import OfflineSACPolicy
 from sb3_dce.uwac_networks import BLOCK_ROWS, ActionVAE, DropoutCritic
 
-VAE_NET_ARCH = [750, 750]
+VAE_NET_ARCH = (750, 750)
 
 
 class UWACPolicy(OfflineSACPolicy):
@@ -59,11 +59,7 @@ class UWACPolicy(OfflineSACPolicy):
         super()._build(lr_schedule)
         kwargs = self._update_features_extractor(self.net_args, None)
         self.vae = ActionVAE(**{**kwargs, "net_arch": self.vae_net_arch}).to(self.device)
-        self.vae.optimizer = self.optimizer_class(
-            self.vae.parameters(),
-            lr=lr_schedule(1),  # type: ignore[call-arg]
-            **self.optimizer_kwargs,
-        )
+        self.vae.optimizer = self.make_optimizer(self.vae, lr_schedule)
         # Not in the state dict: they follow from the seed, and a model may be loaded with other numbers of them.
         generator = th.Generator().manual_seed(self.predict_seed)
         noise = th.randn(self.n_predict_actions, 1, get_action_dim(self.action_space), generator=generator, device="cpu")

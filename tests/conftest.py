@@ -116,9 +116,7 @@ def make_point_mass() -> Callable[[], PointMass]:
 def random_transitions() -> Callable[..., Transitions]:
     """A function that makes data of any width: no episode structure, actions uniform in ``[-high, high]``."""
 
-    def make(
-        n_rows: int = 100, obs_dim: int = OBS_DIM, act_dim: int = ACT_DIM, high: float = 1.0, seed: int = 0
-    ) -> Transitions:
+    def make(n_rows: int = 100, obs_dim: int = OBS_DIM, act_dim: int = ACT_DIM, high: float = 1.0) -> Transitions:
         rng = np.random.default_rng(0)
         ends = np.zeros(n_rows, dtype=bool)
         ends[9::10] = True

@@ -115,8 +115,18 @@ def test_usual_callbacks_work_together(
     assert same(weights(model), weights(checkpoint))
 
 
-def test_progress_bar_flag(agent: Agent, transitions: Transitions) -> None:
-    assert make(agent, dataset=transitions).learn(3, progress_bar=True).num_timesteps == 3
+def test_progress_bar_flag(transitions: Transitions) -> None:
+    seen: list[BaseCallback] = []
+
+    class Look(BaseCallback):
+        def _on_step(self) -> bool:
+            seen.extend(getattr(self.parent, "callbacks", []))
+            return True
+
+    for wanted in (True, False):
+        seen.clear()
+        OfflineBC("MlpPolicy", dataset=transitions).learn(1, Look(), progress_bar=wanted)
+        assert any(isinstance(callback, ProgressBarCallback) for callback in seen) == wanted
 
 
 @pytest.mark.parametrize("name", ["eval_freq", "save_freq", "n_steps"])

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import sb3_dce
+from dataset_files import base_arrays
 
 from sb3_dce.data import DatasetCard, Transitions, compare_datasets
 from sb3_dce.errors import DatasetFormatError, DatasetNotFoundError, DatasetSemanticsError
-from tests.commands import sb3_dce
-from tests.dataset_files import base_arrays
 
 
 def made(

@@ -303,8 +303,9 @@ def test_d4rl_compat_without_flags_asks_for_the_time_limit() -> None:
     del arrays["timeouts"]
     with pytest.raises(DatasetSemanticsError, match="max_episode_steps="):
         Transitions.from_arrays(**arrays, d4rl_compat=True)
-    with pytest.raises(ConfigError, match=r"max_episode_steps.*at least 1"):
-        Transitions.from_arrays(**arrays, max_episode_steps=0)
+    for wrong in (0, 1.5, "100", True):
+        with pytest.raises(ConfigError, match=r"max_episode_steps must be an integer in \[1, inf\)"):
+            Transitions.from_arrays(**arrays, max_episode_steps=wrong)
 
 
 # -- rules for all of them -----------------------------------------------------------------------------------------

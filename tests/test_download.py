@@ -26,8 +26,8 @@ import pytest
 from commands import sb3_dce
 from dataset_files import base_arrays, write_plain
 
-from sb3_dce import OfflineDCE
-from sb3_dce.data import catalog, find_file, load_dataset, load_transitions, locking
+from sb3_dce import OfflineDCE, locking
+from sb3_dce.data import catalog, find_file, load_dataset, load_transitions
 from sb3_dce.data import download as download_module
 from sb3_dce.data.download import Patience, download
 from sb3_dce.data.hash_record import record_path
@@ -460,14 +460,13 @@ def hang(*_: Any, **__: Any) -> Any:
 
 @pytest.mark.parametrize("lookup", [fail_to_look_up, hang])
 def test_no_network_is_said_at_once(folder: Path, monkeypatch: pytest.MonkeyPatch, lookup: Callable[..., Any]) -> None:
-    """L-11: with the default times; one look-up for all mirrors of a host."""
+    """L-11: one look-up for all mirrors of a host."""
     calls: list[Any] = []
     monkeypatch.setattr(socket, "getaddrinfo", lambda *args, **options: calls.append(args) or lookup())
     set_official(monkeypatch, "http://host.invalid/offline_rl/")
-    started = time.monotonic()
     with pytest.raises(DownloadError, match=r"host cannot be reached(?s:.*)by hand(?s:.*)SB3_DCE_DATASETS"):
         download(NAME, cache_dir=folder, mirrors=["http://host.invalid/a", "http://host.invalid/b"])
-    assert len(calls) == 1 and time.monotonic() - started < 2
+    assert len(calls) == 1, "neither again nor for the other mirrors"
 
 
 def test_refused_connection_is_not_retried(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,6 +11,7 @@ import gymnasium as gym
 import numpy as np
 import pandas as pd
 import pytest
+from dataset_files import write_plain
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -20,7 +21,6 @@ from sb3_dce.data.examination import examine
 from sb3_dce.data.selection import rows_of_best_episodes
 from sb3_dce.envs import SpacesEnv
 from sb3_dce.errors import DatasetError, DatasetFormatError, DatasetSemanticsError, DatasetWarning, SB3DCEError
-from tests.dataset_files import write_plain
 
 IDS = np.repeat(["B-12", "A-3", "B-1"], [5, 4, 6])
 

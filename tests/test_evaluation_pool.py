@@ -59,7 +59,6 @@ def test_many_policies_at_a_time_get_the_returns_of_one_process(pool: Evaluation
     pending = [(model, seed, pool.submit(model, rollouts, seed)) for model in agents() for seed in (0, 50_000)]
     for model, seed, episodes in pending:
         assert episodes.result() == rollouts.play(deterministic_act(model), seed)
-        assert episodes.done()
 
 
 @pytest.mark.parametrize("n_envs", [None, 2])
@@ -87,7 +86,7 @@ def test_a_model_with_its_own_predict_is_evaluated_here(pool: EvaluationPool, ro
 
     model = Still("MlpPolicy", make_env_if_possible(HOPPER), policy_kwargs=SMALL)
     pending = pool.submit(model, rollouts, 0)
-    assert pending.done() and pending.result() == rollouts.play(deterministic_act(model), 0)
+    assert pending.result() == rollouts.play(deterministic_act(model), 0)
 
 
 def test_what_goes_wrong_is_said(pool: EvaluationPool, rollouts: Rollouts) -> None:
@@ -182,7 +181,9 @@ def test_no_process_is_left_behind(tmp_path: Path, how: str) -> None:
         "from sb3_dce.envs import make_env_if_possible\n"
         "from sb3_dce.rollouts import make_rollouts\n"
         "from sb3_dce.evaluation_pool import EvaluationPool\n"
+        "import signal\n"
         "if __name__ == '__main__':\n"
+        "    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where the tests run in the background\n"
         f"    model = OfflineBC('MlpPolicy', make_env_if_possible('{HOPPER}'), seed=0)\n"
         "    pool = EvaluationPool(1)\n"
         f"    pool.submit(model, make_rollouts('{HOPPER}', 1), 0).result()\n"
@@ -200,12 +201,16 @@ def test_no_process_is_left_behind(tmp_path: Path, how: str) -> None:
         env={**os.environ, "OMP_NUM_THREADS": "1"},
     )
     assert process.stdout is not None
-    worker = int(process.stdout.readline())
-    if how == "interrupted":
-        os.killpg(process.pid, signal.SIGINT)
-    else:
-        process.kill()
-    _, report = process.communicate(timeout=60)
+    try:
+        worker = int(process.stdout.readline())
+        if how == "interrupted":
+            os.killpg(process.pid, signal.SIGINT)
+        else:
+            process.kill()
+        _, report = process.communicate(timeout=60)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
     assert how == "killed" or ("KeyboardInterrupt" in report and "Process SpawnProcess" not in report)
     deadline = time.monotonic() + 30
     while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:

@@ -53,6 +53,7 @@ def test_without_a_compiler_updates_run_eager(execution: str, monkeypatch: pytes
         assert choose_execution("auto", 10**6, CPU) == "eager"
 
 
+@needs_compiler
 def test_failing_compiler_is_no_reason_to_stop(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(function: Any, **options: Any) -> Any:
         def call(*arguments: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,17 @@ from update_tools import all_tensors, largest_difference, to_float64
 from sb3_dce import OfflineBC, OfflineDCE, Transitions
 from sb3_dce.agents import AGENTS
 from sb3_dce.population import Population
+from sb3_dce.warm_up import ActorWarmUp
 
 pytestmark = pytest.mark.gpu
 SMALL = {"batch_size": 8, "policy_kwargs": {"net_arch": [16, 16]}, "seed": 0, "learning_rate": 1e-3}
 
 
 def make(data: Transitions, agent: Any = OfflineDCE, **kwargs: Any) -> Any:
-    model = agent("MlpPolicy", dataset=data, **{"device": "cuda", **SMALL, **kwargs})
+    settings = {"device": "cuda", **SMALL, **kwargs}
+    if issubclass(agent, ActorWarmUp):
+        settings.setdefault("policy_eval_start", 20)  # within the updates of a test
+    model = agent("MlpPolicy", dataset=data, **settings)
     model.attach_dataset()
     return to_float64(model)
 
@@ -57,14 +62,16 @@ def test_replays_use_new_noise_and_new_rows(transitions: Transitions) -> None:
     assert len(set(before)) == 4
 
 
-def test_a_captured_update_follows_the_batch_size_the_seed_and_the_data(transitions: Transitions) -> None:
+def test_a_captured_update_follows_the_batch_size_the_seed_and_the_data(
+    transitions: Transitions, random_transitions: Callable[..., Transitions]
+) -> None:
     eager, captured = (make(transitions, execution=execution) for execution in ("eager", "cudagraph"))
     for model in (eager, captured):
         for batch_size in (8, 12, 8):
             model.train(6, batch_size)
         model.set_random_seed(3)
         model.train(6, 8)
-        model.set_dataset(transitions)
+        model.set_dataset(random_transitions(60))
         model.train(6, 8)
     assert largest_difference(all_tensors(eager), all_tensors(captured)) <= 1e-10
 
@@ -86,7 +93,7 @@ def test_a_thousand_replays_allocate_nothing(transitions: Transitions) -> None:
     before = th.cuda.memory_allocated()
     model.train(1000, 8)
     th.cuda.synchronize()
-    assert th.cuda.memory_allocated() <= before + 2**20
+    assert th.cuda.memory_allocated() <= before
 
 
 def test_model_trained_on_the_device_goes_on_elsewhere(transitions: Transitions, tmp_path: Path) -> None:
@@ -121,6 +128,8 @@ def test_population_that_draws_on_the_device_is_captured_with_its_draws(normaliz
         population = Population(models, "cuda", execution)
         for _ in range(3):
             population.train(10)
+        engine = population._engine
+        assert engine is not None and (execution == "eager" or any(source is not None for _, source in engine._captured))
         members.append([all_tensors(model) for model in population.commit()])
     for eager, captured in zip(*members, strict=True):
         assert largest_difference(eager, captured) <= 1e-10

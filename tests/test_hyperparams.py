@@ -29,7 +29,7 @@ BETAS = {
     row["dataset"]: [float(value) for key, value in row.items() if key != "dataset"] for row in _table("beta_schedules.csv")
 }
 ROWS = [(algo, name, row) for algo in AGENTS for name, row in hyperparams.read_rows(algo).items()]
-all_rows = pytest.mark.parametrize(("algo", "name", "row"), ROWS, ids=[f"{algo}-{name}" for algo, name, _ in ROWS])
+all_algorithms = pytest.mark.parametrize("algo", AGENTS)
 
 
 def _distinct_rows() -> list[tuple[str, str, dict[str, Any]]]:
@@ -44,34 +44,35 @@ def _distinct_rows() -> list[tuple[str, str, dict[str, Any]]]:
 DISTINCT = _distinct_rows()
 
 
-@all_rows
-def test_row_says_how_long_to_train_which_policy(algo: str, name: str, row: dict[str, Any]) -> None:
-    arguments, n_timesteps, zoo = hyperparams.split_row(row)
-    assert n_timesteps == 1_000_000
-    assert arguments["policy"] == "MlpPolicy"
-    assert zoo == {}
+@all_algorithms
+def test_rows_say_how_long_to_train_which_policy(algo: str) -> None:
+    for name, row in hyperparams.read_rows(algo).items():
+        arguments, n_timesteps, zoo = hyperparams.split_row(row)
+        assert (n_timesteps, arguments["policy"], zoo) == (1_000_000, "MlpPolicy", {}), name
 
 
-@all_rows
-def test_numbers_are_not_read_as_text(algo: str, name: str, row: dict[str, Any]) -> None:
-    text = {key for key, value in row.items() if isinstance(value, str)}
-    assert text <= {"policy", "dataset", "ent_coef", "reward_normalization", "actor_lr_schedule"}
-    assert isinstance(row["learning_rate"], float)
-    assert row.get("ent_coef", "auto") == "auto" or isinstance(row["ent_coef"], float)
+@all_algorithms
+def test_numbers_are_not_read_as_text(algo: str) -> None:
+    for name, row in hyperparams.read_rows(algo).items():
+        text = {key for key, value in row.items() if isinstance(value, str)}
+        assert text <= {"policy", "dataset", "ent_coef", "reward_normalization", "actor_lr_schedule"}, name
+        assert isinstance(row["learning_rate"], float), name
+        assert row.get("ent_coef", "auto") == "auto" or isinstance(row["ent_coef"], float), name
 
 
-@all_rows
-def test_keys_are_constructor_parameters_or_known_to_the_zoo(algo: str, name: str, row: dict[str, Any]) -> None:
+@all_algorithms
+def test_keys_are_constructor_parameters_or_known_to_the_zoo(algo: str) -> None:
     parameters = inspect.signature(AGENTS[algo]).parameters
-    assert set(row) <= {*parameters, *hyperparams.ZOO_KEYS}
-    hyperparams.check_keys(AGENTS[algo], row)
+    for name, row in hyperparams.read_rows(algo).items():
+        assert set(row) <= {*parameters, *hyperparams.ZOO_KEYS}, name
+        hyperparams.check_keys(AGENTS[algo], row)
 
 
-@all_rows
-def test_row_name_is_its_dataset_a_catalogue_id_and_an_environment(algo: str, name: str, row: dict[str, Any]) -> None:
-    if name == "default":
-        assert "dataset" not in row
-    else:
+@all_algorithms
+def test_row_names_are_their_datasets_catalogue_ids_and_environments(algo: str) -> None:
+    rows = hyperparams.read_rows(algo)
+    assert "dataset" not in rows.pop("default")
+    for name, row in rows.items():
         assert row["dataset"] == name == catalog.resolve(name).id
         assert name in gym.registry
 

@@ -139,7 +139,9 @@ def begin() -> Iterator[Callable[[list[str], Path, str], subprocess.Popen[str]]]
     started: list[subprocess.Popen[str]] = []
 
     def start(command: list[str], folder: Path, ready: str) -> subprocess.Popen[str]:
-        arguments = [sys.executable, "-c", "from sb3_dce.cli import main; main()", *command, *FAST, "--out", str(folder)]
+        # a test run in the background of a shell passes on that Ctrl-C is ignored
+        code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from sb3_dce.cli import main; main()"
+        arguments = [sys.executable, "-c", code, *command, *FAST, "--out", str(folder)]
         pipes = {"stderr": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
         process = subprocess.Popen(arguments, start_new_session=True, **pipes)  # type: ignore[call-overload]
         started.append(process)

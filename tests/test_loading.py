@@ -90,7 +90,7 @@ def test_an_option_that_no_reader_has_is_refused_with_a_near_miss(kind: str, tmp
     sources = {"arrays": arrays, "frame": as_frame(arrays), "buffer": as_buffer(arrays)}
     with pytest.raises(ConfigError, match="'action_scales' is no option of this reader") as caught:
         load_dataset(sources.get(kind, path), action_scales="data")
-    assert caught.value.key == "action_scales" and caught.value.hint == "Did you mean action_scale?"
+    assert caught.value.key == "action_scales" and caught.value.hint == "Did you mean 'action_scale'?"
 
 
 def test_action_scale_takes_the_bounds_of_the_data_and_says_so() -> None:

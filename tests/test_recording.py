@@ -229,12 +229,14 @@ def test_workers_of_a_killed_recording_end_with_it(tmp_path: Path) -> None:
         "import pathlib, sys; from sb3_dce.recording import RecordingSpec, parts, record; parts.FLUSH_ROWS = 1000; "
         "record(RecordingSpec('random', 'Pendulum-v1'), pathlib.Path(sys.argv[1]), n_rows=10**9, workers=2)"
     )
-    parent = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "x.hdf5")])
-    wait_until(lambda: len(list((tmp_path / "x.hdf5.parts").glob("*.npz"))) > 0)
-    workers = [Path("/proc") / pid for pid in Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()]
+    with subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "x.hdf5")]) as parent:
+        try:
+            wait_until(lambda: len(list((tmp_path / "x.hdf5.parts").glob("*.npz"))) > 0)
+            children = Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()
+        finally:
+            parent.kill()
+    workers = [Path("/proc") / pid for pid in children]
     assert len(workers) >= 2
-    parent.kill()
-    parent.wait()
     wait_until(lambda: not any(worker.exists() for worker in workers))
 
 

@@ -21,10 +21,10 @@ from rich.console import Console
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_dce import OfflineDCE, OfflineIQL, files, runs, saving
-from sb3_dce.data.locking import held
 from sb3_dce.errors import CheckpointError, ConfigError, DatasetWarning, DivergenceError
 from sb3_dce.evaluation import EvaluationCallback
 from sb3_dce.execution import Engine
+from sb3_dce.locking import held
 from sb3_dce.population import Population
 from sb3_dce.population_runs import BatchedRuns
 from sb3_dce.processes import UninterruptedBlock, threads_from_environment
@@ -206,7 +206,7 @@ def test_a_second_process_leaves_a_run_alone(tmp_path: Path) -> None:
 
 
 def test_lock_of_a_killed_process_is_free(tmp_path: Path) -> None:
-    code = "import sys, time\nfrom pathlib import Path\nfrom sb3_dce.data.locking import held\n"
+    code = "import sys, time\nfrom pathlib import Path\nfrom sb3_dce.locking import held\n"
     code += "with held(Path(sys.argv[1])):\n    print('held', flush=True)\n    time.sleep(60)"
     with subprocess.Popen([sys.executable, "-c", code, str(tmp_path / ".lock")], stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout is not None and other.stdout.readline() == "held\n"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -344,18 +343,22 @@ def test_killed_command_goes_on_and_counts_nothing_twice(tmp_path: Path) -> None
         arguments = [*command, "--out", str(tmp_path / name)]
         return subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment)
 
-    killed = start("killed")
-    deadline = time.monotonic() + 200
-    while len(list(tmp_path.glob("killed/runs/*/checkpoint.zip"))) < 2 and time.monotonic() < deadline:
-        assert killed.poll() is None, killed.communicate()[1]
-        time.sleep(0.02)
-    os.kill(killed.pid, signal.SIGKILL)  # the command alone: its workers have to notice
-    killed.wait()
+    with start("killed") as killed:
+        deadline = time.monotonic() + 90
+        try:
+            while len(list(tmp_path.glob("killed/runs/*/checkpoint.zip"))) < 2 and time.monotonic() < deadline:
+                assert killed.poll() is None, killed.communicate()[1]
+                time.sleep(0.02)
+        finally:
+            killed.kill()  # the command alone: its workers have to notice
     begun = {path.name for path in (tmp_path / "killed" / "runs").iterdir()}
     assert begun and not list(tmp_path.glob("killed/rows/*"))
     for name in ("killed", "whole"):
-        process = start(name)
-        assert process.wait(timeout=280) == 0, process.communicate()[1]
+        with start(name) as process:
+            try:
+                assert process.wait(timeout=90) == 0, process.communicate()[1]
+            finally:
+                process.kill()
     rows = [results.read_folder(tmp_path / name / "rows") for name in ("killed", "whole")]
     # diagnostics are means since the last row of the log, which a resume begins anew; the code may have gone on meanwhile
     evaluated = [frame[frame["metric"].isin(["score", "return"])].drop(columns="code_version") for frame in rows]

@@ -69,11 +69,16 @@ def test_precision_makes_no_other_run_and_stands_beside_the_device(finished: Pat
     config = yaml.safe_load((finished / "config.yml").read_text())
     for part in (config["run"]["overrides"], config["hyperparameters"]):
         part["precision"] = "bf16-matmul"
+    config["machine"]["precision"] = "bf16-matmul"
     (tmp_path / "run" / "config.yml").write_text(yaml.safe_dump(config))
     plain, rounded = results.rows_of_run(finished, "table1"), results.rows_of_run(tmp_path / "run", "table1")
     assert plain is not None and rounded is not None
     assert set(plain["device"]) == {"cpu"} and set(rounded["device"]) == {"cpu bf16-matmul"}
     assert keys_of(plain) == keys_of(rounded)
+    config["machine"]["precision"] = "float32"  # asked for, on a processor that does not have it
+    (tmp_path / "run" / "config.yml").write_text(yaml.safe_dump(config))
+    (device,) = set(results.rows_of_run(tmp_path / "run", "table1")["device"])  # type: ignore[index]
+    assert device == "cpu"
     assert set(rounded["hyperparameters"]) == set(plain["hyperparameters"])
 
 

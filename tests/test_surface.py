@@ -19,6 +19,7 @@ import pandas as pd
 import pytest
 import torch as th
 from agents_under_test import AGENTS, COMMON_METRICS, Agent, make
+from commands import sb3_dce
 from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -35,7 +36,6 @@ from sb3_dce.errors import ConfigError, DatasetError, DatasetIntegrityError, Dat
 from sb3_dce.evaluation import EvaluationCallback, evaluate
 from sb3_dce.population import Population
 from sb3_dce.rollouts import make_rollouts, rollouts_of
-from tests.commands import sb3_dce
 
 TINY = "halfcheetah-tiny-sb3"
 

@@ -253,10 +253,14 @@ def test_cloning_at_the_start_compiles_twice_and_not_per_step(transitions: Trans
 def test_update_with_rounded_products_is_compiled(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sb3_dce.precision.missing_for", lambda precision, device: None)
     monkeypatch.setattr("sb3_dce.precision._rounds_itself", lambda: False)
-    settings = {"n_actions": 2, "policy_kwargs": {"net_arch": [32]}, "precision": "bf16-matmul", "execution": "compile"}
-    model = make_model(transitions, **settings)
-    model.train(2, BATCH)
-    assert model._engine.execution == "compile", "not fallen back to eager"
+    models = []
+    for precision in ("float32", "bf16-matmul"):  # products in float64 are not rounded, nor are those of narrow layers
+        settings = {"n_actions": 2, "policy_kwargs": {"net_arch": [64, 64]}, "execution": "compile", "precision": precision}
+        models.append(OfflineCQL("MlpPolicy", dataset=transitions, seed=0, **settings))
+        models[-1].attach_dataset()
+        models[-1].train(2, BATCH)
+        assert models[-1]._engine.execution == "compile", "not fallen back to eager"
+    assert largest_difference(*map(all_tensors, models)) > 0
 
 
 def test_update_changes_nothing_in_place(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:

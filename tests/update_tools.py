@@ -5,7 +5,6 @@ checks that compiled and many-at-once execution equal the eager reference.
 
 from __future__ import annotations
 
-import shutil
 import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -15,10 +14,11 @@ import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch.utils._pytree import tree_leaves, tree_map
 
+from sb3_dce import execution
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.execution import Engine
 
-needs_compiler = pytest.mark.skipif(not any(map(shutil.which, ("g++", "clang++"))), reason="needs a C++ compiler")
+needs_compiler = pytest.mark.skipif(not execution._has_compiler(), reason="needs a C++ compiler and the headers of Python")
 
 
 class Step(NamedTuple):

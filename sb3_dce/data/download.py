@@ -32,10 +32,10 @@ from sb3_dce.data.file_checks import HDF5_SIGNATURE
 from sb3_dce.data.hash_record import as_sha256, read_record, record_path, verify_hash, verify_record, write_record
 from sb3_dce.data.hdf5 import D4RLFile
 from sb3_dce.data.locate import DATASETS_VARIABLE, cache_folder, search, search_folders
-from sb3_dce.data.locking import exclusive
 from sb3_dce.data.network import Failed, Patience, make_opener, network_errors
 from sb3_dce.errors import CheckpointError, DatasetError, DatasetIntegrityError, DownloadError
 from sb3_dce.files import expanded, sync_folder, write_text
+from sb3_dce.locking import exclusive
 
 _LOG = logging.getLogger(__name__)
 MIRRORS_VARIABLE = "SB3_DCE_MIRRORS"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import os
 from collections.abc import Mapping
@@ -13,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from sb3_dce.checks import check_optional, did_you_mean
 from sb3_dce.data.hashes import file_sha256
 from sb3_dce.data.hdf5 import DEFAULT_MAX_BYTES
 from sb3_dce.errors import ConfigError, DatasetFormatError, DatasetIntegrityError
@@ -60,12 +60,7 @@ class ReadOptions:
 
     def __post_init__(self) -> None:
         for name in ("max_episode_steps", "obs_dim", "act_dim", "max_bytes"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ConfigError(
-                    f"must be at least 1, got {value}", where=name, hint="Leave it out for the default", key=name
-                )
-
+            check_optional(name, getattr(self, name), 1, integer=True, hint="Leave it out for the default.")
         if self.action_scale is None:
             return
         if self.action_low is not None or self.action_high is not None:
@@ -92,11 +87,10 @@ class ReadOptions:
         names = [option.name for option in fields(cls)]
         for name in options:
             if name not in names:
-                close = difflib.get_close_matches(name, names, n=1)
                 raise ConfigError(
                     f"{name!r} is no option of this reader; there are {', '.join(names)}",
                     key=name,
-                    hint=f"Did you mean {close[0]}?" if close else "Leave it out",
+                    hint=did_you_mean(name, names).strip() or "Leave it out.",
                 )
         return cls(**options)
 

@@ -29,6 +29,7 @@ from sb3_dce.theory import beta_eff, shift_factor, value_shift_factor
 
 UPDATES_PER_EPOCH = 1000
 TIMING = "run-times"  # its runs are too short to say anything about scores
+TAIL = 0.1  # share of a run, from its end, that stands for what it has become
 GAMMA, TAU = 0.99, 0.005  # of all DCE runs of the figures (paper, common configuration)
 
 
@@ -250,24 +251,23 @@ class Evidence:
         """
         return curve_of(self.runs(variant, dataset_id), metric)
 
-    def tail(self, variant: Variant, dataset_id: str, metric: str, share: float = 0.1) -> float | None:
+    def tail(self, variant: Variant, dataset_id: str, metric: str) -> float | None:
         """
         :param variant: of the experiment
         :param dataset_id: data
         :param metric: name
-        :param share: of the run that counts, from its end
-        :return: mean over this part and over seeds; ``None`` without values in it, as when all runs diverged before
+        :return: mean over the last tenth of the run and over seeds; ``None`` without values in it, as when all runs diverged
+            before
         """
-        return self.tail_mean(self.curve(variant, dataset_id, metric), dataset_id, share)
+        return self.tail_mean(self.curve(variant, dataset_id, metric), dataset_id)
 
-    def tail_mean(self, curve: pd.DataFrame, dataset_id: str, share: float = 0.1) -> float | None:
+    def tail_mean(self, curve: pd.DataFrame, dataset_id: str) -> float | None:
         """
         :param curve: one column per seed, indexed by gradient steps
         :param dataset_id: data of its runs
-        :param share: of the run that counts, from its end
         :return: as :meth:`tail`
         """
-        late = curve[curve.index > (1.0 - share) * (self.n_updates(dataset_id) or 0)]
+        late = curve[curve.index > (1.0 - TAIL) * (self.n_updates(dataset_id) or 0)]
         return float(np.nanmean(late.to_numpy())) if late.notna().any(axis=None) else None
 
     # -- theory ----------------------------------------------------------------------------------------------------
@@ -288,12 +288,13 @@ class Evidence:
         # means over intervals of other widths cannot be subtracted
         lowered = curves[0] - curves[1] if curves[0].index[:1].equals(curves[1].index[:1]) else pd.DataFrame()
         lowered = lowered.dropna(how="all").dropna(axis=1, how="all")
-        unit = self.beta_eff(variant, dataset_id)
+        settings = settings_in_force(variant, dataset_id, self.scale)
+        unit, gamma, tau = self.beta_eff(variant, dataset_id), settings["gamma"], settings["tau"]
         steps = np.asarray(lowered.index, dtype=int)
         width = int(steps[0]) if len(steps) else 0
         # logged values are means over the interval before the step
         factor = shift_factor if of == "q_data" else value_shift_factor
-        expected = [unit * factor(max(1, int(step - width / 2)), GAMMA, TAU) for step in steps]
+        expected = [unit * factor(max(1, int(step - width / 2)), gamma, tau) for step in steps]
         return lowered, pd.Series(expected, index=lowered.index, dtype=float)
 
     def beta_eff(self, variant: Variant, dataset_id: str) -> float:

@@ -19,8 +19,9 @@ from typing import Any
 
 import yaml
 
-from sb3_dce import configuration, hyperparams
+from sb3_dce import configuration
 from sb3_dce.agents import agent_class
+from sb3_dce.checks import did_you_mean
 from sb3_dce.configuration import config_hash, differences
 from sb3_dce.data.catalog import resolve
 from sb3_dce.data.locate import known_dataset, search
@@ -223,7 +224,7 @@ def load_experiment(experiment_id: str) -> Experiment:
     """
     known = experiment_ids()
     if experiment_id not in known:
-        hint = f"{hyperparams.did_you_mean(experiment_id, known)}Known: {', '.join(known)}."
+        hint = f"{did_you_mean(experiment_id, known)}Known: {', '.join(known)}."
         raise ConfigError(f"no experiment {experiment_id!r}", key="id", hint=hint)
     grid = _read(f"{experiment_id}.yml")
     defaults = _read("scales.yml")

@@ -14,11 +14,10 @@ from rich.console import Console
 from rich.table import Table
 from stable_baselines3.common.utils import get_device
 
-from sb3_dce.checks import check_choice, check_ends_with_evaluation
+from sb3_dce.checks import check_choice, check_ends_with_evaluation, did_you_mean
 from sb3_dce.data.catalog import resolve
 from sb3_dce.data.hashes import sha256_once
 from sb3_dce.data.locate import search
-from sb3_dce.data.locking import exclusive
 from sb3_dce.errors import ConfigError
 from sb3_dce.experiments import results
 from sb3_dce.experiments.evidence import Evidence
@@ -38,8 +37,9 @@ from sb3_dce.experiments.reports import Report, count, make_report
 from sb3_dce.experiments.run import execute, is_complete
 from sb3_dce.experiments.tables import parts_of
 from sb3_dce.files import check_writable
-from sb3_dce.hyperparams import did_you_mean, full_name
+from sb3_dce.hyperparams import full_name
 from sb3_dce.launch import raise_first
+from sb3_dce.locking import exclusive
 from sb3_dce.precision import PRECISIONS, missing_for
 from sb3_dce.runs import RunSpec, read_config, refuse_other_run
 from sb3_dce.sb3_checks import check_device

@@ -25,7 +25,7 @@ from sb3_dce.data.catalog import resolve
 from sb3_dce.data.hashes import sha256_once
 from sb3_dce.data.locate import catalogue_id, short_name
 from sb3_dce.errors import CheckpointError, SB3DCEError
-from sb3_dce.evaluation import read_evaluations
+from sb3_dce.evaluation import Evaluation, read_evaluations
 from sb3_dce.experiments.grid import PlannedRun
 from sb3_dce.files import write_atomically
 from sb3_dce.runs import read_config, read_divergence, read_result
@@ -296,7 +296,7 @@ def _evaluations(folder: Path, dataset_id: str | None, n_updates: int) -> list[t
         n_paper = PAPER_EPISODES.get(family or "")
         if n_paper is not None and last.score is not None and len(last.returns) >= n_paper:
             # the first episodes, which were fixed before anything was known about them
-            first = type(last)(last.n_updates, last.returns[:n_paper], last.lengths[:n_paper], dataset_id)
+            first = Evaluation(last.n_updates, last.returns[:n_paper], last.lengths[:n_paper], dataset_id)
             assert first.score is not None
             values.append((n_updates, "score_paper_episodes", first.score))
     return values

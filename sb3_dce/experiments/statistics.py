@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_dce.student import student_quantile
+from sb3_dce import student
 
 Scores = Sequence[np.ndarray]
 
@@ -40,19 +40,16 @@ def sample_std(values: np.ndarray) -> float:
     :param values: one number per seed, shape (n,)
     :return: standard deviation with divisor n - 1; NaN for one seed
     """
-    return float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
+    return float(student.sample_std(values))
 
 
 def mean_interval(scores: np.ndarray) -> Interval:
     """
-    95 % interval of the mean of one task by Student's t. Of so few seeds a bootstrap draws nothing but their range, which
-    holds the mean in three of four cases only.
-
-    :param scores: one number per seed, at least two
-    :return: bounds
+    :param scores: of one task, one number per seed, at least two
+    :return: 95 % interval of the mean by Student's t
     """
-    reach = student_quantile(len(scores) - 1) * sample_std(scores) / np.sqrt(len(scores))
-    return Interval(float(scores.mean() - reach), float(scores.mean() + reach))
+    low, high = student.mean_interval(scores)
+    return Interval(float(low), float(high))
 
 
 def trimmed_mean(values: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
@@ -94,21 +91,17 @@ def mean_of_tasks(scores: Scores) -> np.ndarray:
 def bootstrap_interval(
     scores: Scores,
     aggregate: Callable[[Scores], np.ndarray] = mean_of_tasks,
-    n_resamples: int = N_RESAMPLES,
-    seed: int = BOOTSTRAP_SEED,
 ) -> Interval:
     """
     Stratified bootstrap: seeds are drawn anew with replacement within each task, the aggregate is computed again.
 
     :param scores: one array per task
     :param aggregate: number of interest, computed along the last axis
-    :param n_resamples: repetitions
-    :param seed: of the draws
     :return: percentiles 2.5 and 97.5
     """
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(BOOTSTRAP_SEED)
     tasks = [np.asarray(task, dtype=float) for task in scores]
-    draws = [task[generator.integers(len(task), size=(n_resamples, len(task)))] for task in tasks]
+    draws = [task[generator.integers(len(task), size=(N_RESAMPLES, len(task)))] for task in tasks]
     low, high = np.percentile(aggregate(draws), [2.5, 97.5])
     return Interval(float(low), float(high))
 

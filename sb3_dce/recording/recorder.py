@@ -30,7 +30,7 @@ from sb3_dce.envs import dataset_of_env
 from sb3_dce.errors import ConfigError, SB3DCEError
 from sb3_dce.files import check_writable
 from sb3_dce.numpy_policy import NumpyPolicy
-from sb3_dce.processes import prepare_worker
+from sb3_dce.processes import end_workers, prepare_worker
 from sb3_dce.recording.episodes import Arrays, EpisodeRunner, RecordingSpec
 from sb3_dce.recording.parts import Parts
 
@@ -331,9 +331,7 @@ def _parallel_chunks(runner: EpisodeRunner, first: int, workers: int) -> Iterato
             hint="The same command goes on from here; try a smaller --workers.",
         ) from None
     finally:
-        for process in list((pool._processes or {}).values()):
-            process.terminate()
-        pool.shutdown(wait=True, cancel_futures=True)
+        end_workers(pool)
 
 
 @contextmanager

@@ -21,6 +21,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_dce import envs, hyperparams
 from sb3_dce.agents import AGENTS
+from sb3_dce.checks import did_you_mean
 from sb3_dce.data import catalog, locate
 from sb3_dce.errors import ConfigError, SB3DCEError
 from sb3_dce.zoo import registry
@@ -64,7 +65,7 @@ def launch(argv: list[str]) -> None:
         return
     if script not in SCRIPTS:
         what = f"unknown script {script!r}" if script else "no script given"
-        raise ConfigError(what, hint=f"{hyperparams.did_you_mean(script, SCRIPTS)}Scripts: {', '.join(SCRIPTS)}.")
+        raise ConfigError(what, hint=f"{did_you_mean(script, SCRIPTS)}Scripts: {', '.join(SCRIPTS)}.")
     try:
         algorithms = registry.register()
     except ModuleNotFoundError as error:
@@ -98,10 +99,10 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
 
 def _check_names(options: argparse.Namespace, algorithms: dict[str, type[BaseAlgorithm]]) -> None:
     if options.algo not in algorithms:
-        hint = f"{hyperparams.did_you_mean(options.algo, algorithms)}Algorithms: {', '.join(algorithms)}."
+        hint = f"{did_you_mean(options.algo, algorithms)}Algorithms: {', '.join(algorithms)}."
         raise ConfigError(f"unknown algorithm {options.algo!r}", where="--algo", key="algo", hint=hint)
     if options.env not in gym.registry and not options.gym_packages:
-        hint = f"{hyperparams.did_you_mean(options.env, gym.registry)}Dataset ids are given in full, with version."
+        hint = f"{did_you_mean(options.env, gym.registry)}Dataset ids are given in full, with version."
         raise ConfigError(f"unknown environment {options.env!r}", where="--env", key="env", hint=hint)
 
 
