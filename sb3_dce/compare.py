@@ -26,7 +26,8 @@ from sb3_dce.files import write_text
 from sb3_dce.hyperparams import check_keys, full_name
 from sb3_dce.launch import launch_all, raise_first
 from sb3_dce.plots import plot_learning_curves
-from sb3_dce.runs import RunSpec, check_before_running, last_metrics, read_divergence, read_result
+from sb3_dce.run_files import RunSpec, last_metrics, read_divergence, read_result
+from sb3_dce.runs import check_before_running
 from sb3_dce.student import sample_std
 
 BANDS = (

@@ -23,7 +23,8 @@ from sb3_dce.launch import launch
 from sb3_dce.plots import plot_learning_curves
 from sb3_dce.processes import usable_cores
 from sb3_dce.rollouts import Rollouts, make_rollouts
-from sb3_dce.runs import RunSpec, alone
+from sb3_dce.run_files import RunSpec
+from sb3_dce.runs import alone
 
 DATASET = "halfcheetah-demo-sb3"
 N_UPDATES = 20_000

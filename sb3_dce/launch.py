@@ -24,7 +24,8 @@ from sb3_dce.errors import DivergenceError, SB3DCEError
 from sb3_dce.evaluation import Evaluation
 from sb3_dce.messages import show_warnings_as_lines
 from sb3_dce.processes import prepare_worker, termination_as_interrupt, threads_from_environment, usable_cores
-from sb3_dce.runs import RunSpec, StoppedError
+from sb3_dce.run_files import RunSpec, write_divergence
+from sb3_dce.runs import StoppedError
 
 # With more runs than this the bars of those that are done make room for the others.
 BARS_KEPT = 20
@@ -290,7 +291,7 @@ def train_one(spec: RunSpec, report: runs.Report, stop: Callable[[], bool] = lam
     try:
         return runs.run(spec, report, stop)
     except DivergenceError as error:
-        runs.write_divergence(Path(spec.folder), int(error.index or 0), error.what)
+        write_divergence(Path(spec.folder), int(error.index or 0), error.what)
         raise
     except SB3DCEError:
         raise

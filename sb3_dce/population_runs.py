@@ -32,16 +32,8 @@ from sb3_dce.launch import launch, progress_display, show_evaluation
 from sb3_dce.population import Population
 from sb3_dce.processes import termination_as_interrupt, usable_cores
 from sb3_dce.rollouts import Rollouts, rollouts_of
-from sb3_dce.runs import (
-    RunSpec,
-    alone,
-    make_logger,
-    read_result,
-    refuse_other_run,
-    write_config,
-    write_divergence,
-    write_result,
-)
+from sb3_dce.run_files import RunSpec, make_logger, read_result, write_config, write_divergence, write_result
+from sb3_dce.runs import alone, refuse_other_run
 
 # Beside the members' folders: how far all have come, and the state of the common random generator.
 STATE_FILE = "population.pt"

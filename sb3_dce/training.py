@@ -25,7 +25,8 @@ from sb3_dce.files import quoted
 from sb3_dce.launch import launch_all, raise_first
 from sb3_dce.plots import plot_learning_curves
 from sb3_dce.rollouts import Rollouts, rollouts_of
-from sb3_dce.runs import RunSpec, check_before_running, read_config
+from sb3_dce.run_files import RunSpec, read_config
+from sb3_dce.runs import check_before_running
 from sb3_dce.saving import existing_zip, saved_algo
 
 

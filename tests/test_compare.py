@@ -18,8 +18,8 @@ from sb3_dce.data import Transitions, resolve
 from sb3_dce.data.catalog import normalized_score
 from sb3_dce.errors import CheckpointError, ConfigError
 from sb3_dce.evaluation import Evaluation, write_evaluations
-from sb3_dce.plots import _interval
-from sb3_dce.runs import RunSpec
+from sb3_dce.run_files import RunSpec
+from sb3_dce.student import mean_interval
 
 TINY = "halfcheetah-tiny-sb3"
 
@@ -186,6 +186,6 @@ def test_agents_that_do_not_exist_or_come_twice_are_refused(tmp_path: Path) -> N
 @pytest.mark.parametrize(("n", "quantile"), [(3, 4.3027), (5, 2.7764), (12, 2.2010), (31, 2.0423), (1000, 1.9623)])
 def test_confidence_interval_is_students(n: int, quantile: float) -> None:
     values = np.random.default_rng(0).standard_normal((n, 2))
-    low, high = _interval(values)
+    low, high = mean_interval(values)
     assert np.allclose((low + high) / 2, values.mean(axis=0))
     assert np.allclose((high - low) / 2, quantile * values.std(axis=0, ddof=1) / np.sqrt(n), rtol=2e-3)

@@ -19,12 +19,13 @@ import yaml
 from commands import sb3_dce
 from update_tools import all_tensors, largest_difference
 
-from sb3_dce import OfflineDCE, OfflineIQL, configuration, runs
+from sb3_dce import OfflineDCE, OfflineIQL, configuration
 from sb3_dce.data import find_file
 from sb3_dce.errors import ConfigError
 from sb3_dce.evaluation import read_evaluations
 from sb3_dce.experiments import results
-from sb3_dce.runs import RunSpec, StoppedError, check_before_running, read_result, run
+from sb3_dce.run_files import RunSpec, read_result, write_divergence
+from sb3_dce.runs import StoppedError, check_before_running, run
 from sb3_dce.saving import saved_timesteps
 
 TINY = "halfcheetah-tiny-sb3"
@@ -127,7 +128,7 @@ def test_settings_that_no_training_can_have_leave_nothing(overrides: dict[str, A
 def test_seed_that_diverges_ends_no_other(tmp_path: Path) -> None:
     command = ["train", TINY, "--updates", "20", "--eval-freq", "10", "--eval-episodes", "1", "--workers", "1", *FAST]
     (tmp_path / "seed_0").mkdir(parents=True)
-    runs.write_divergence(tmp_path / "seed_0", 7, "metrics not finite: train/q_data")
+    write_divergence(tmp_path / "seed_0", 7, "metrics not finite: train/q_data")
     outcome = sb3_dce(*command, "--seeds", "2", "--out", str(tmp_path))
     assert outcome.code == 2 and "metrics not finite" in outcome.stderr and "Traceback" not in outcome.stderr
     assert read_result(tmp_path / "seed_1") is not None and "seed_1/model.zip" in outcome.stdout

@@ -22,7 +22,8 @@ from sb3_dce.evaluation import read_evaluations
 from sb3_dce.evaluation_pool import EvaluationPool
 from sb3_dce.population import Population
 from sb3_dce.population_runs import STATE_FILE, BatchedRuns, train_population
-from sb3_dce.runs import RunSpec, read_divergence, run
+from sb3_dce.run_files import RunSpec, read_divergence
+from sb3_dce.runs import run
 
 TINY = "halfcheetah-tiny-sb3"
 QUICK = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 16}

@@ -28,7 +28,8 @@ from sb3_dce.locking import held
 from sb3_dce.population import Population
 from sb3_dce.population_runs import BatchedRuns
 from sb3_dce.processes import UninterruptedBlock, threads_from_environment
-from sb3_dce.runs import RunSpec, alone, read_divergence, read_result, run
+from sb3_dce.run_files import RunSpec, read_divergence, read_result
+from sb3_dce.runs import alone, run
 from sb3_dce.saving import saved_algo
 
 TINY = "halfcheetah-tiny-sb3"

@@ -34,7 +34,8 @@ from sb3_dce.experiments.probe import prepare_probe
 from sb3_dce.experiments.reproduce import Request, plan_runs, reproduce, scale_of
 from sb3_dce.experiments.run import execute, is_complete, populations
 from sb3_dce.population_runs import BatchedRuns
-from sb3_dce.runs import RunSpec, read_divergence, run
+from sb3_dce.run_files import RunSpec, read_divergence
+from sb3_dce.runs import run
 from sb3_dce.training import load_any
 
 TINY = "halfcheetah-tiny-sb3"

@@ -19,7 +19,8 @@ from sb3_dce.errors import CheckpointError
 from sb3_dce.experiments import results
 from sb3_dce.experiments.grid import PlannedRun, load_experiment
 from sb3_dce.experiments.results import ResultsError
-from sb3_dce.runs import RunSpec, run, write_divergence
+from sb3_dce.run_files import RunSpec, write_divergence
+from sb3_dce.runs import run
 
 TINY = "halfcheetah-tiny-sb3"
 QUICK = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 16}

@@ -9,6 +9,7 @@ asked by another folder or another version of this package. What has arrived her
 from __future__ import annotations
 
 import hashlib
+import os
 import platform
 import socket
 import traceback
@@ -17,12 +18,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import torch as th
 from rich.console import Console
 
 import sb3_dce
+from sb3_dce.data.locate import cache_folder
 from sb3_dce.errors import ConfigError, DivergenceError, SB3DCEError
 from sb3_dce.files import write_atomically
-from sb3_dce.runs import RunSpec, source_commit
+from sb3_dce.launch import train_one
+from sb3_dce.processes import threads_from_environment
+from sb3_dce.run_files import RunSpec, read_result, source_commit
 
 # Written last: they are the marks of a complete run.
 MARKS = ("result.json", "diverged.json")
@@ -133,27 +138,19 @@ def train_on_node(spec: RunSpec, asker: str) -> Outcome:
     :param asker: from :func:`asker_of`
     :return: its files
     """
-    import os
-
-    import torch as th
-
-    from sb3_dce import launch, runs
-    from sb3_dce.data.locate import cache_folder
-    from sb3_dce.processes import threads_from_environment
-
     th.set_num_threads(threads_from_environment() or 1)
     node = os.environ.get("SB3_DCE_NODE") or platform.node()
     folder = cache_folder().parent / "cluster" / node / f"{Path(spec.folder).name}--{asker}"
     here = replace(spec, folder=str(folder))
     try:
-        launch.train_one(here, lambda progress: None)
+        train_one(here, lambda progress: None)
     except DivergenceError as error:
         return Outcome(node, send(folder), str(error), diverged=True)
     except SB3DCEError as error:
         return Outcome(node, {}, str(error), diverged=False)
     except Exception:
         return Outcome(node, {}, traceback.format_exc(limit=-3), diverged=False)
-    assert runs.read_result(folder) is not None
+    assert read_result(folder) is not None
     return Outcome(node, send(folder), None, diverged=False)
 
 

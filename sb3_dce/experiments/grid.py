@@ -26,7 +26,7 @@ from sb3_dce.configuration import config_hash, differences
 from sb3_dce.data.catalog import resolve
 from sb3_dce.data.locate import known_dataset, search
 from sb3_dce.errors import ConfigError, DatasetNotFoundError
-from sb3_dce.runs import RunSpec
+from sb3_dce.run_files import RunSpec
 
 SCALES = ("smoke", "cpu", "full")
 EMBEDDED = "halfcheetah-tiny-sb3"

@@ -12,7 +12,7 @@ from pathlib import Path
 from sb3_dce.dce import OfflineDCE
 from sb3_dce.dce_probe import OfflineDCEProbe
 from sb3_dce.errors import ConfigError
-from sb3_dce.runs import RunSpec
+from sb3_dce.run_files import RunSpec
 
 
 def prepare_probe(spec: RunSpec, best_policy: Path) -> None:

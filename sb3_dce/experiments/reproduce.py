@@ -41,7 +41,8 @@ from sb3_dce.hyperparams import full_name
 from sb3_dce.launch import raise_first
 from sb3_dce.locking import exclusive
 from sb3_dce.precision import PRECISIONS, missing_for
-from sb3_dce.runs import RunSpec, read_config, refuse_other_run
+from sb3_dce.run_files import RunSpec, read_config
+from sb3_dce.runs import refuse_other_run
 from sb3_dce.sb3_checks import check_device
 
 DEVICES = ("auto", "cpu", "cuda")

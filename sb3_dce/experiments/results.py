@@ -28,7 +28,7 @@ from sb3_dce.errors import CheckpointError, SB3DCEError
 from sb3_dce.evaluation import Evaluation, read_evaluations
 from sb3_dce.experiments.grid import PlannedRun
 from sb3_dce.files import write_atomically
-from sb3_dce.runs import read_config, read_divergence, read_result
+from sb3_dce.run_files import progress_logs, read_config, read_divergence, read_result
 
 COLUMNS = (
     "experiment",
@@ -322,15 +322,14 @@ def read_log(folder: Path) -> pd.DataFrame:
     :param folder: of a run
     :return: its log by gradient steps; where it was killed and went on from a checkpoint, what the resumed run wrote counts
     """
-    starts = {path: int(path.stem.partition("_")[2]) for path in folder.glob("progress_*.csv") if path.stat().st_size}
     parts: list[pd.DataFrame] = []
-    for path in sorted(starts, key=starts.__getitem__):
+    for first, path in progress_logs(folder):
         part = pd.read_csv(path, on_bad_lines="skip")  # the last line may have been cut by a kill
         if "time/total_timesteps" not in part:
             continue
         part = part.dropna(subset=["time/total_timesteps"]).groupby("time/total_timesteps").first()
-        parts = [earlier[earlier.index <= starts[path]] for earlier in parts]
-        parts.append(part[part.index > starts[path]])
+        parts = [earlier[earlier.index <= first] for earlier in parts]
+        parts.append(part[part.index > first])
     parts = [part for part in parts if len(part)]
     if not parts:
         return pd.DataFrame()

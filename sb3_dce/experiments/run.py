@@ -23,7 +23,7 @@ from sb3_dce.experiments.probe import prepare_probe
 from sb3_dce.launch import launch_all
 from sb3_dce.population import free_parameters
 from sb3_dce.population_runs import train_population
-from sb3_dce.runs import RunSpec, read_divergence, read_result
+from sb3_dce.run_files import RunSpec, read_divergence, read_result
 
 # More members than this are trained one population after the other. The second table is for agents that evaluate
 # their critics on many rows per sample: 10 x 100 of UWAC, 20 of PBRL's ten critics, 30 of CQL.

@@ -1,0 +1,290 @@
+"""
+The files in the folder of a run: what it is, its result, its log.
+
+``config.yml`` is what is run, ``result.json`` the mark of a complete run and ``diverged.json`` that of one that diverged,
+``progress_<n>.csv`` the log from update n on.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+import yaml
+from stable_baselines3.common.logger import Logger, make_output_format
+
+import sb3_dce
+from sb3_dce.base import OfflineAlgorithm
+from sb3_dce.data import find_file
+from sb3_dce.data.hashes import sha256_once
+from sb3_dce.data.locate import short_name
+from sb3_dce.errors import CheckpointError
+from sb3_dce.evaluation import Evaluation
+from sb3_dce.files import write_text
+from sb3_dce.precision import missing_for
+
+BEGIN_ANEW = "Delete the run's folder to run it anew, or choose another one with --out."
+
+
+@dataclass(frozen=True)
+class RunSpec:
+    """
+    What is to be run.
+
+    :param algo: name of the agent
+    :param dataset: id or file
+    :param seed: fixes networks, batches, noise and evaluation episodes
+    :param n_updates: gradient steps
+    :param folder: where everything is written
+    :param eval_freq: gradient steps between two evaluations (and checkpoints)
+    :param n_eval_episodes: episodes of each evaluation
+    :param overrides: constructor arguments that replace those of the dataset's row
+    :param label: name for displays; empty for agent and seed
+    :param device: where it is trained, "auto", "cpu" or "cuda"; recorded, but no setting of the run
+    """
+
+    algo: str
+    dataset: str
+    seed: int
+    n_updates: int
+    folder: str
+    eval_freq: int = 5000
+    n_eval_episodes: int = 10
+    overrides: dict[str, Any] = field(default_factory=dict)
+    label: str = ""
+    device: str = "auto"
+
+    @property
+    def name(self) -> str:
+        """
+        :return: short name for displays
+        """
+        return self.label or f"{self.algo} seed {self.seed}"
+
+
+def write_config(
+    spec: RunSpec, model: OfflineAlgorithm, folder: Path, device: th.device | None = None, n_members: int = 1
+) -> None:
+    """
+    Write ``config.yml``: what is run, on which data, with which versions on what kind of machine.
+
+    :param spec: what is run
+    :param model: its model, with the data attached
+    :param folder: where it is written
+    :param device: where it is trained; ``None`` for the model's own
+    :param n_members: of the population it is trained in
+    """
+    assert model.dataset is not None
+    path, known = find_file(model.dataset)
+    # the row that it began with, whatever the file is called by now
+    before = (read_config(folder) or {}).get("dataset", {})
+    row = before.get("row", None if known is None else known.id)
+    device = device or model.device
+    hyperparameters = {name: plain(value) for name, value in model.hyperparameters().items()}
+    config = {
+        "run": settings_of_run(spec),
+        "command": " ".join(["sb3-dce", *sys.argv[1:]]) if Path(sys.argv[0]).name == "sb3-dce" else None,
+        "dataset": {"name": model.dataset, "row": row, "sha256": sha256_once(path), **(model.dataset_statistics or {})},
+        "hyperparameters": hyperparameters,
+        "versions": {
+            "sb3_dce": sb3_dce.__version__,
+            "commit": source_commit(),
+            "python": platform.python_version(),
+            **{name: version(name) for name in ("torch", "stable-baselines3", "gymnasium", "mujoco", "numpy")},
+        },
+        "machine": {
+            "processor": platform.machine(),
+            "device": str(device) if n_members == 1 else f"{device.type}, population of {n_members}",
+            # the one asked for is among the hyperparameters; a device that does not have it computes in float32
+            "precision": "float32" if missing_for(model.precision, device) else model.precision,
+            "threads": th.get_num_threads(),
+        },
+    }
+    write_text(folder / "config.yml", yaml.safe_dump(config, sort_keys=False))
+
+
+def plain(value: Any) -> Any:
+    """
+    :param value: of a hyperparameter
+    :return: the same as YAML keeps it; what it does not know becomes a text
+    """
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return value.item()
+    return value if value is None or isinstance(value, bool | int | float | str) else repr(value)
+
+
+def read_config(folder: Path) -> dict[str, Any] | None:
+    """
+    :param folder: folder of a run
+    :return: its ``config.yml``, ``None`` if it has not begun
+    :raises CheckpointError: if the file is damaged
+    """
+    return _read(folder / "config.yml", yaml.safe_load)
+
+
+def _read(path: Path, parse: Callable[[str], Any], keys: Sequence[str] = ()) -> dict[str, Any] | None:
+    """A file of a run, None if there is none."""
+    if not path.is_file():
+        return None
+    try:
+        content = parse(path.read_text(encoding="utf-8"))
+    except (ValueError, yaml.YAMLError, RecursionError, OSError) as error:
+        raise CheckpointError("the file is damaged", where=str(path), path=path, hint=BEGIN_ANEW) from error
+    complete = isinstance(content, dict) and all(key in content for key in keys)
+    if not complete or ("n_updates" in keys and not isinstance(content["n_updates"], int)):
+        raise CheckpointError("the file is not that of a run", where=str(path), path=path, hint=BEGIN_ANEW)
+    return content
+
+
+def write_result(spec: RunSpec, folder: Path, evaluations: list[Evaluation], seconds: float) -> dict[str, Any]:
+    """
+    Write ``result.json``, the mark of a complete run.
+
+    :param spec: what was run
+    :param folder: where it is written
+    :param evaluations: all evaluations of the run; the last one counts
+    :param seconds: of training
+    :return: the result
+    """
+    last = evaluations[-1] if evaluations else None
+    result = {
+        "config": settings_of_run(spec),
+        "n_updates": spec.n_updates,
+        "seconds": round(seconds, 1),
+        "returns": None if last is None else list(last.returns),
+        "mean_return": None if last is None else last.mean,
+        "normalized_score": None if last is None else last.score,
+        "evaluated_at": None if last is None else last.n_updates,
+    }
+    write_text(folder / "result.json", json.dumps(result, indent=1))
+    return result
+
+
+def read_result(folder: Path) -> dict[str, Any] | None:
+    """
+    :param folder: folder of a run
+    :return: its result, ``None`` if it is not complete
+    :raises CheckpointError: if the file is damaged
+    """
+    keys = ("config", "n_updates", "seconds", "mean_return", "normalized_score")
+    return _read(folder / "result.json", json.loads, keys)
+
+
+def write_divergence(folder: Path, n_updates: int, reason: str) -> None:
+    """
+    Write ``diverged.json``: a run that diverges is a result too, and would do the same again.
+
+    :param folder: of the run
+    :param n_updates: gradient steps before which it happened
+    :param reason: in words
+    """
+    write_text(folder / "diverged.json", json.dumps({"n_updates": n_updates, "reason": reason}))
+
+
+def progress_logs(folder: Path) -> list[tuple[int, Path]]:
+    """
+    :param folder: of a run
+    :return: the update after which each log begins, and its file, in this order; those without a line are left out
+    """
+    logs = [(int(path.stem.rpartition("_")[2]), path) for path in folder.glob("progress_*.csv") if path.stat().st_size]
+    return sorted(logs)
+
+
+def last_metrics(folder: Path) -> dict[str, float]:
+    """
+    :param folder: of a run
+    :return: the diagnostics it logged last, by name without ``train/``; empty if there are none
+    """
+    for _, path in reversed(progress_logs(folder)):
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+        if rows:
+            named = ((name.removeprefix("train/"), value) for name, value in rows[-1].items() if name.startswith("train/"))
+            return {name: float(value) for name, value in named if value}
+    return {}
+
+
+def read_divergence(folder: Path) -> dict[str, Any] | None:
+    """
+    :param folder: folder of a run
+    :return: what :func:`write_divergence` wrote, ``None`` if the run has not diverged
+    :raises CheckpointError: if the file is damaged
+    """
+    return _read(folder / "diverged.json", json.loads, ("n_updates", "reason"))
+
+
+@lru_cache(maxsize=1)
+def source_commit() -> str | None:
+    """
+    :return: commit of the checkout this package is used from, ``None`` for an installed one
+    """
+    root = Path(sb3_dce.__file__).parent.parent
+    if not (root / ".git").exists() or shutil.which("git") is None:
+        return None
+    command = ["git", "-C", str(root), "rev-parse", "--short=10", "HEAD"]
+    answer = subprocess.run(command, capture_output=True, text=True)
+    return answer.stdout.strip() or None
+
+
+def settings_of_run(spec: RunSpec) -> dict[str, Any]:
+    """
+    :param spec: what is run
+    :return: what makes it this run and no other: neither its folder nor how and where it is run
+    """
+    return {key: value for key, value in asdict(spec).items() if key not in ("folder", "label", "device")}
+
+
+def make_logger(spec: RunSpec, model: OfflineAlgorithm, folder: Path) -> Logger:
+    """
+    :param spec: what is run
+    :param model: its model, at the update from which it goes on
+    :param folder: where it is written
+    :return: logger to a file of this beginning and, if the model asks for it, to TensorBoard
+    """
+    formats = [make_output_format("csv", str(folder), f"_{model.num_timesteps}")]
+    if model.tensorboard_log is not None:
+        name = f"{spec.algo}_{short_name(spec.dataset)}_{spec.seed}"
+        formats.append(make_output_format("tensorboard", str(Path(model.tensorboard_log) / name)))
+    return Logger(str(folder), formats)
+
+
+def forget_logs_after(folder: Path, n_updates: int) -> None:
+    """
+    Delete logs that begin after the update from which a run goes on: its checkpoint was deleted, and what they tell is
+    trained anew.
+
+    :param folder: of the run
+    :param n_updates: where it goes on
+    """
+    for first, path in progress_logs(folder):
+        if first > n_updates:
+            path.unlink()
+
+
+def seconds_before(folder: Path) -> float:
+    """
+    :param folder: of a run that goes on
+    :return: seconds of training before, from its logs
+    """
+    total = 0.0
+    for _, path in progress_logs(folder):
+        with path.open(newline="", encoding="utf-8") as file:
+            elapsed = [row.get("time/time_elapsed") for row in csv.DictReader(file)]
+        total += max((float(value) for value in elapsed if value), default=0.0)
+    return total
