@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.checks import check_optional
 
 
-class ActorLearningRate:
+class ActorLearningRate(OfflineAlgorithm):
     """Mixin of agents with the parameter ``actor_learning_rate``; ``None`` is the rate of the other networks."""
 
     population_scalars: ClassVar[frozenset[str]] = frozenset({"actor_learning_rate"})
@@ -17,13 +18,13 @@ class ActorLearningRate:
         """
         :raises ConfigError: if a parameter is out of its range
         """
-        super().check_parameters()  # type: ignore[misc]
+        super().check_parameters()
         check_optional("actor_learning_rate", self.actor_learning_rate, 0, open_low=True, hint="None takes learning_rate.")
 
     def learning_rates(self) -> dict[str, float]:
         """
         :return: learning rates of the next update by coefficient, ``actor_learning_rate`` among them
         """
-        rates: dict[str, float] = super().learning_rates()  # type: ignore[misc]
+        rates = super().learning_rates()
         own = self.actor_learning_rate
         return {**rates, "actor_learning_rate": rates["learning_rate"] if own is None else own}

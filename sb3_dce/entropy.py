@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any, ClassVar
 
-import numpy as np
 import torch as th
+from stable_baselines3.common.preprocessing import get_action_dim
 
 from sb3_dce import losses
+from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.errors import ConfigError
 from sb3_dce.optimizers import AdamSettings, Learner
 from sb3_dce.state import LearnedNumber
@@ -38,7 +39,7 @@ def parse_ent_coef(ent_coef: str | float) -> tuple[bool, float]:
     return learned, value
 
 
-class EntropyCoefficient:
+class EntropyCoefficient(OfflineAlgorithm):
     """Mixin of agents with the parameters ``ent_coef`` and ``target_entropy``; the names are those of SB3's SAC."""
 
     population_scalars: ClassVar[frozenset[str]] = frozenset({"ent_coef", "target_entropy"})
@@ -51,7 +52,7 @@ class EntropyCoefficient:
         """
         :raises ConfigError: if a parameter is out of its range
         """
-        super().check_parameters()  # type: ignore[misc]
+        super().check_parameters()
         parse_ent_coef(self.ent_coef)
         if self.target_entropy != "auto":
             try:
@@ -71,8 +72,8 @@ class EntropyCoefficient:
         """
         learned, value = parse_ent_coef(self.ent_coef)
         start = th.log(th.full((1,), value)) if learned else None
-        rate = self.lr_schedule(1)  # type: ignore[attr-defined]
-        numbers: dict[str, LearnedNumber] = super().learned_numbers()  # type: ignore[misc]
+        rate = self.lr_schedule(1)
+        numbers = super().learned_numbers()
         return {**numbers, ENT_COEF: LearnedNumber("ent_coef_optimizer", start, rate)}
 
     def coefficients(self, n_updates: int) -> dict[str, float]:
@@ -80,13 +81,13 @@ class EntropyCoefficient:
         :param n_updates: completed updates
         :return: numbers of the next update that may change while training
         """
-        coefficients = super().coefficients(n_updates)  # type: ignore[misc]
+        coefficients = super().coefficients(n_updates)
         learned, value = parse_ent_coef(self.ent_coef)
         if not learned:
             return {**coefficients, "ent_coef": value}
         target = self.target_entropy
         if target == "auto":
-            target = -float(np.prod(self.action_space.shape))  # type: ignore[attr-defined]
+            target = -float(get_action_dim(self.action_space))
         return {**coefficients, "target_entropy": float(target)}
 
 

@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch as th
 
+from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.checks import check_number, check_optional
 from sb3_dce.state import Storage
 
@@ -15,7 +16,7 @@ OOD_Q = "ood_q"  # name of the recorded value in the state tree
 N_RECENT, N_RECORDED = 5, 20
 
 
-class OODWeight:
+class OODWeight(OfflineAlgorithm):
     """Mixin of agents with the parameters ``ood_weight*``, ``adaptive_ood_weight`` and ``steps_per_epoch``."""
 
     population_scalars: ClassVar[frozenset[str]] = frozenset(
@@ -32,13 +33,12 @@ class OODWeight:
     ood_q: th.Tensor  # Q(s, a ~ pi) of the last update, on the device; recorded while the weight is adaptive
     recorded_q: list[float]  # one value per epoch, the last 20
     n_ood_weight_decays: int
-    _n_updates: int
 
     def check_parameters(self) -> None:
         """
         :raises ConfigError: if a parameter is out of its range
         """
-        super().check_parameters()  # type: ignore[misc]
+        super().check_parameters()
         for name in ("ood_weight", "ood_weight_next", "ood_weight_min"):
             check_number(name, getattr(self, name), 0)
         check_optional("ood_weight_final", self.ood_weight_final, 0, hint="None is a constant weight.")
@@ -48,8 +48,8 @@ class OODWeight:
 
     def setup_extras(self) -> None:
         """Create the memory of the adaptive weight."""
-        super().setup_extras()  # type: ignore[misc]
-        self.ood_q = th.zeros(1, device=self.device)  # type: ignore[attr-defined]
+        super().setup_extras()
+        self.ood_q = th.zeros(1, device=self.device)
         if not hasattr(self, "recorded_q"):  # else a saved model is being loaded
             self.recorded_q, self.n_ood_weight_decays = [], 0
 
@@ -57,7 +57,7 @@ class OODWeight:
         """
         :return: storage of each network, and of further learners, by name
         """
-        storages: dict[str, Storage] = super().make_storages()  # type: ignore[misc]
+        storages = super().make_storages()
         if self.adaptive_ood_weight:
             storages[OOD_Q] = Storage([self.ood_q])
         return storages
@@ -68,7 +68,7 @@ class OODWeight:
         :return: numbers of the next update that may change while training
         """
         weights = {"ood_weight": self.ood_weight_at(n_updates), "ood_weight_next": self.ood_weight_next}
-        return {**super().coefficients(n_updates), **weights}  # type: ignore[misc]
+        return {**super().coefficients(n_updates), **weights}
 
     def ood_weight_at(self, n_updates: int) -> float:
         """
@@ -105,9 +105,9 @@ class OODWeight:
         self.recorded_q = [*self.recorded_q, ood_q][-N_RECORDED:]
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
-        modules, tensors = super()._get_torch_save_params()  # type: ignore[misc]
+        modules, tensors = super()._get_torch_save_params()
         return modules, [*tensors, OOD_Q]  # always: the rule may be switched on or off when a saved model is loaded
 
     def _excluded_save_params(self) -> list[str]:
-        names: list[Any] = super()._excluded_save_params()  # type: ignore[misc]
+        names = super()._excluded_save_params()
         return [*names, OOD_Q]

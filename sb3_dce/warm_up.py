@@ -5,13 +5,14 @@ from __future__ import annotations
 import warnings
 from typing import Any
 
+from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.checks import check_choice, check_number
 from sb3_dce.errors import SB3DCEWarning
 
 ACTOR_Q_TIMINGS = ("previous", "updated")
 
 
-class ActorWarmUp:
+class ActorWarmUp(OfflineAlgorithm):
     """Mixin of agents with the parameters ``policy_eval_start`` and ``actor_q_timing``."""
 
     policy_eval_start: int
@@ -21,7 +22,7 @@ class ActorWarmUp:
         """
         :raises ConfigError: if a parameter is out of its range
         """
-        super().check_parameters()  # type: ignore[misc]
+        super().check_parameters()
         check_number("policy_eval_start", self.policy_eval_start, 0, integer=True)
         check_choice("actor_q_timing", self.actor_q_timing, ACTOR_Q_TIMINGS)
 
@@ -33,9 +34,9 @@ class ActorWarmUp:
         return n_updates < self.policy_eval_start
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, Any]:
-        total, callback = super()._setup_learn(*args, **kwargs)  # type: ignore[misc]
-        first = self._n_updates  # type: ignore[attr-defined]
-        last = first + total - self.num_timesteps  # type: ignore[attr-defined]
+        total, callback = super()._setup_learn(*args, **kwargs)
+        first = self._n_updates
+        last = first + total - self.num_timesteps
         if first < last <= self.policy_eval_start:
             warnings.warn(
                 f"the actor ignores the critics in all updates from {first:,} to {last:,}: it follows them only after "
