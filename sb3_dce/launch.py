@@ -169,9 +169,8 @@ def _launch(specs: Sequence[RunSpec], n_workers: int, console: Console, keep_goi
                     raise
         except BaseException:
             # Without this an error would wait for every other run to finish.
-            for future in futures:
-                future.cancel()
-            workers.close(at_once=True)
+            begun = [future for future in futures if not future.cancel()]
+            workers.close(at_once=not all(future.done() for future in begun))
             raise
         workers.close(at_once=False)
         return futures
