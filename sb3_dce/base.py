@@ -498,12 +498,20 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
             check_number("log_interval", log_interval, 1, integer=True, hint="It counts gradient steps; None logs nothing.")
         # A log row in the middle of a chunk is harmless: it shows the whole chunk.
         for name, value in callback_frequencies(callback):
-            if value > 0 and value % self.gradient_steps != 0:
-                raise ConfigError(
-                    f"{name}={value} is no multiple of gradient_steps={self.gradient_steps}",
-                    key=name,
-                    hint="Make it one, or set gradient_steps=1: otherwise a callback would see more updates than it counts.",
-                )
+            self.check_frequency(name, value)
+
+    def check_frequency(self, name: str, value: int) -> None:
+        """
+        :param name: parameter of a callback that acts every so many gradient steps
+        :param value: gradient steps
+        :raises ConfigError: if it would act in the middle of a chunk of updates
+        """
+        if value > 0 and value % self.gradient_steps != 0:
+            raise ConfigError(
+                f"{name}={value} is no multiple of gradient_steps={self.gradient_steps}",
+                key=name,
+                hint="Make it one, or set gradient_steps=1: otherwise a callback would see more updates than it counts.",
+            )
 
     def _count_steps(self, n_steps: int, callback: BaseCallback, log_interval: int | None) -> bool:
         """

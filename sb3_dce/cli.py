@@ -92,7 +92,7 @@ def train(
     train_seeds(
         algo=algo,
         dataset=dataset,
-        n_updates=None if updates is None else _steps(updates),
+        n_updates=None if updates is None else check_steps("--updates", updates),
         seeds=range(first_seed, first_seed + seeds),
         eval_freq=eval_freq,
         n_eval_episodes=eval_episodes,
@@ -136,7 +136,7 @@ def compare(
     names = list(_names(algos))
     n_workers = workers or usable_cores()
     run_comparison(
-        *(dataset, names, _steps(updates), range(seeds), eval_freq, eval_episodes, n_workers, out, console),
+        *(dataset, names, check_steps("--updates", updates), range(seeds), eval_freq, eval_episodes, n_workers, out, console),
         overrides=_parse_overrides(set_ or []),
         updates_of=_parse_lengths(updates_of or []),
     )
@@ -205,7 +205,7 @@ def reproduce(
         agents=_names(agents, ";" if ";" in agents else ","),
         seeds=seeds,
         first_seed=first_seed,
-        updates=None if updates is None else _steps(updates),
+        updates=None if updates is None else check_steps("--updates", updates),
         eval_freq=eval_freq,
         workers=workers or usable_cores(),
         device=device,
@@ -265,11 +265,6 @@ def _parse_overrides(pairs: list[str]) -> dict[str, Any]:
             raise ConfigError(f"--set {pair} sets no hyperparameter", key="--set", hint=other)
         overrides[key.strip()] = value
     return overrides
-
-
-def _steps(updates: float) -> int:
-    """Gradient steps are written as 1e6, too, and so arrive as a float."""
-    return check_steps("--updates", updates)
 
 
 def _parse_lengths(pairs: list[str]) -> dict[str, int]:

@@ -96,7 +96,7 @@ def run(spec: RunSpec, report: Report = lambda progress: None, stop: Callable[[]
         return done
     seen = _stage(folder)
     model = _model(spec, folder)
-    _check_frequency(spec, model)
+    model.check_frequency("eval_freq", spec.eval_freq)  # ``learn`` would, but when the folder is already that of this run
     model.attach_dataset()
     try:
         folder.mkdir(parents=True, exist_ok=True)  # not before: a run that is refused leaves nothing behind
@@ -186,15 +186,17 @@ def refuse_other_run(spec: RunSpec, folder: Path) -> None:
     config = read_config(folder)
     if config is None:
         return
-    begun, data = (part if isinstance(part, dict) else {} for part in (config.get("run"), config.get("dataset")))
+    parts = (config.get(name) for name in ("run", "dataset", "hyperparameters"))
+    begun, data, settings = (part if isinstance(part, dict) else {} for part in parts)
     wanted = plain(settings_of_run(spec))
     differing = [key for key in wanted if key not in ("n_updates", "dataset") and begun.get(key) != wanted[key]]
     length = begun.get("n_updates")
-    if _reached(folder) > spec.n_updates or (length != wanted["n_updates"] and _depends_on_length(config)):
+    if _reached(folder) > spec.n_updates or (length != wanted["n_updates"] and _depends_on_length(settings)):
         differing.append("n_updates")
     changes = [f"{key}={begun.get(key)!r} there, {wanted[key]!r} now" for key in differing]
     if not changes:
-        changes = _changed_hyperparameters(spec, config)
+        row = data.get("row", catalogue_id(data.get("name")))
+        changes = _changed_hyperparameters(settings, settings_in_force(spec.algo, row, spec.overrides))
     # The same data may be named otherwise: by an id, from another folder, after a move.
     there, now = str(data.get("sha256")), sha256_once(find_file(spec.dataset)[0])
     if there != now:
@@ -217,13 +219,10 @@ def _reached(folder: Path) -> int:
     return reached
 
 
-def _changed_hyperparameters(spec: RunSpec, config: dict[str, Any]) -> list[str]:
+def _changed_hyperparameters(there: dict[str, Any], in_force: dict[str, Any]) -> list[str]:
     """What a changed row of the hyperparameter file, or a default of another version, would make of the run."""
-    there = config.get("hyperparameters")
-    there = there if isinstance(there, dict) else {}
-    row = config["dataset"].get("row", catalogue_id(config["dataset"].get("name")))
     changes = []
-    for name, value in settings_in_force(spec.algo, row, spec.overrides).items():
+    for name, value in in_force.items():
         # networks are told by the row or by none; a schedule is a function, which has no value to compare
         if name in NOT_HYPERPARAMETERS or name not in there or callable(value) or (name == "policy_kwargs" and not value):
             continue
@@ -232,9 +231,7 @@ def _changed_hyperparameters(spec: RunSpec, config: dict[str, Any]) -> list[str]
     return changes
 
 
-def _depends_on_length(config: dict[str, Any]) -> bool:
-    settings = config.get("hyperparameters")
-    settings = settings if isinstance(settings, dict) else {}
+def _depends_on_length(settings: dict[str, Any]) -> bool:
     scheduled = isinstance(settings.get("learning_rate"), str)  # a function, as text
     return scheduled or settings.get("actor_lr_schedule") == "cosine"
 
@@ -258,7 +255,7 @@ def check_before_running(specs: Sequence[RunSpec]) -> None:
         try:
             agent = agent_class(spec.algo)
             model = agent.load_dataset(spec.dataset, seed=spec.seed, **{"device": "cpu", **spec.overrides})
-            _check_frequency(spec, model)
+            model.check_frequency("eval_freq", spec.eval_freq)
         except ConfigError as error:
             where = f"{spec.algo}, {error.where}" if error.where else spec.algo
             raise ConfigError(error.what, where=where, hint=error.hint, key=error.key) from error
@@ -270,16 +267,6 @@ def check_before_running(specs: Sequence[RunSpec]) -> None:
                 where=spec.algo,
                 hint="Check policy_kwargs and what else was set.",
             ) from error
-
-
-def _check_frequency(spec: RunSpec, model: OfflineAlgorithm) -> None:
-    """``learn`` would refuse it, too, but only when the folder is already that of a run with this setting."""
-    if spec.eval_freq % model.gradient_steps:
-        raise ConfigError(
-            f"eval_freq={spec.eval_freq} is no multiple of gradient_steps={model.gradient_steps}",
-            key="eval_freq",
-            hint="Make it one, or leave gradient_steps at 1.",
-        )
 
 
 def _model(spec: RunSpec, folder: Path) -> OfflineAlgorithm:

@@ -73,7 +73,7 @@ def train_seeds(
         for seed in seeds
     ]
     # a run of an earlier version may have been begun without this check
-    if rollouts_of(dataset, n_eval_episodes) is not None and any(read_config(Path(s.folder)) is None for s in specs):
+    if any(read_config(Path(s.folder)) is None for s in specs) and rollouts_of(dataset, n_eval_episodes) is not None:
         check_ends_with_evaluation(total, eval_freq)
     check_before_running(specs)
     outcomes = launch_all(specs, workers, console)
