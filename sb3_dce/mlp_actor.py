@@ -18,7 +18,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from torch.nn import functional as F
 
 from sb3_dce.networks import StandardizedExtractor
-from sb3_dce.numpy_policy import actor_parts, plain_layers
+from sb3_dce.policy_parts import actor_parts, plain_layers
 
 IN_PLACE: dict[str, Callable[[th.Tensor], Any]] = {
     "relu": th.relu_,

@@ -22,7 +22,8 @@ from sb3_dce.agents import AGENTS
 from sb3_dce.envs import SpacesEnv
 from sb3_dce.errors import CheckpointError, ConfigError
 from sb3_dce.iql import OfflineIQL
-from sb3_dce.numpy_policy import MLPPolicy, ObsNormalizer, PredictPolicy, RandomPolicy, numpy_policy
+from sb3_dce.numpy_policy import MLPPolicy, ObsNormalizer, PredictPolicy, RandomPolicy
+from sb3_dce.policy_parts import numpy_policy
 from sb3_dce.recording.policy_files import detect_algo, load_policy, read_npz_policy, write_npz_policy
 
 OBSERVATION_SPACE = spaces.Box(-np.inf, np.inf, (5,), np.float64)

@@ -12,12 +12,14 @@ from result_rows import SHA, run_rows, table_rows
 
 from sb3_dce.experiments import results
 from sb3_dce.experiments.claims import claim_table, own_table_facts
+from sb3_dce.experiments.curves import panel_curves
 from sb3_dce.experiments.evidence import Evidence
-from sb3_dce.experiments.figures import panel_curves
 from sb3_dce.experiments.grid import experiment_ids, load_experiment, variant_hash
 from sb3_dce.experiments.judging import HELD, NOT_HELD, UNTESTED, Verdict
 from sb3_dce.experiments.reports import config_table, make_report, toy_table
-from sb3_dce.experiments.tables import TextTable, aggregate_tables, common_rows, runtime_table, score_table
+from sb3_dce.experiments.run_times import runtime_table
+from sb3_dce.experiments.tables import aggregate_tables, common_rows, score_table
+from sb3_dce.experiments.text_table import TextTable
 from sb3_dce.experiments.verdicts import verdicts
 from sb3_dce.theory import shift_factor
 

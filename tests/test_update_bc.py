@@ -21,7 +21,7 @@ from update_tools import (
 )
 
 from sb3_dce import OfflineBC, OfflineSAC, Transitions, losses
-from sb3_dce.numpy_policy import numpy_policy
+from sb3_dce.policy_parts import numpy_policy
 
 BATCH = 8
 

@@ -7,8 +7,9 @@ from collections.abc import Mapping
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.judging import HELD, NOT_HELD, UNTESTED, Values, Verdict, judge, lengths_and_seeds
 from sb3_dce.experiments.paper import PAPER_SEEDS, gym_rows, leaders, paper_score, paper_scores, paper_total
+from sb3_dce.experiments.run_times import RunTime, fastest_runs
 from sb3_dce.experiments.statistics import sample_std
-from sb3_dce.experiments.tables import RunTime, TextTable, fastest_runs
+from sb3_dce.experiments.text_table import TextTable
 
 TABLES = ("table1", "table-adroit-kitchen")
 ADROIT = [f"{task}-{kind}-v0" for kind in ("human", "cloned") for task in ("pen", "hammer", "door", "relocate")]

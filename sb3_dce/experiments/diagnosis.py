@@ -11,7 +11,7 @@ import numpy as np
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import Variant, settings_in_force
 from sb3_dce.experiments.judging import CLEARLY, CLOSE, differs, uncertainty
-from sb3_dce.experiments.tables import TextTable
+from sb3_dce.experiments.text_table import TextTable
 from sb3_dce.schedules import StepSchedule
 
 # A change counts as a cause if it closes this share of the distance to the better of BC and IQL.

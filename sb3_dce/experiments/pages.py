@@ -10,7 +10,8 @@ from sb3_dce.experiments.claims import claim_table, own_table_facts
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.judging import CLEARLY, Verdict
 from sb3_dce.experiments.reports import Report, count
-from sb3_dce.experiments.tables import TextTable, parts_of
+from sb3_dce.experiments.tables import parts_of
+from sb3_dce.experiments.text_table import TextTable
 from sb3_dce.files import write_text
 
 HEADINGS = {

@@ -17,6 +17,7 @@ from sb3_dce.experiments.statistics import Total, total
 METHODS = ("BC", "UWAC", "PBRL", "IQL", "TD3-BC", "CQL", "DCE")
 PAPER_SEEDS = 5
 TABLES = {"table1": "gym", "table-adroit-kitchen": "adroit_kitchen"}
+MIXED_PROTOCOLS = "The paper's baselines are copied from other papers, with other protocols."
 
 
 class PaperScore(NamedTuple):

@@ -9,13 +9,14 @@ import numpy as np
 from sb3_dce.configuration import row_of
 from sb3_dce.dce import OfflineDCE
 from sb3_dce.experiments import diagnosis, tables
+from sb3_dce.experiments.curves import panel_curves, variants_of
 from sb3_dce.experiments.evidence import Evidence
-from sb3_dce.experiments.figures import panel_curves, variants_of
 from sb3_dce.experiments.grid import Variant, source_of
 from sb3_dce.experiments.judging import CLOSE, HELD, NOT_HELD, UNTESTED, Verdict, judge
 from sb3_dce.experiments.paper import paper_score, read_csv
+from sb3_dce.experiments.run_times import runtime_table
 from sb3_dce.experiments.statistics import mean_interval
-from sb3_dce.experiments.tables import TextTable
+from sb3_dce.experiments.text_table import TextTable
 from sb3_dce.experiments.verdicts import verdicts
 from sb3_dce.schedules import StepSchedule
 from sb3_dce.theory import penalty_bound, sampling_bound, upper_bound
@@ -61,11 +62,11 @@ def make_report(evidence: Evidence) -> Report:
     if kind == "table":
         found["scores"] = tables.score_table(evidence)
         found |= {f"aggregates-{part}": table for part, table in tables.aggregate_tables(evidence).items()}
-        found["run-times"] = tables.runtime_table(evidence)
+        found["run-times"] = runtime_table(evidence)
         found["long"] = tables.long_table(evidence)
         judged.append(reproduction(evidence))
     elif kind == "run-times":
-        found["run-times"] = tables.runtime_table(evidence)
+        found["run-times"] = runtime_table(evidence)
     elif kind == "figure":
         found["long"] = tables.long_table(evidence)
     elif kind == "bounds":

@@ -1,22 +1,13 @@
-"""Tables made from rows: Markdown, LaTeX and CSV of the same cells, the paper's numbers in columns of their own."""
+"""Tables made from rows: scores, totals and a long one for programs, the paper's numbers in columns of their own."""
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import NamedTuple
-
 import numpy as np
-import pandas as pd
 
 from sb3_dce.data.catalog import resolve
-from sb3_dce.execution import UPDATES_WORTH_COMPILING
 from sb3_dce.experiments.evidence import Evidence, at_end, curve_of
 from sb3_dce.experiments.grid import Variant, source_of, variant_hash
-from sb3_dce.experiments.paper import paper_score, paper_scores
+from sb3_dce.experiments.paper import MIXED_PROTOCOLS, paper_score
 from sb3_dce.experiments.statistics import (
     N_RESAMPLES,
     Interval,
@@ -28,8 +19,7 @@ from sb3_dce.experiments.statistics import (
     sample_std,
     total,
 )
-from sb3_dce.files import write_text
-from sb3_dce.precision import PRECISIONS
+from sb3_dce.experiments.text_table import TextTable
 
 BOLD_RULE = (
     "Bold: the 95 % interval over seeds (Student's t) overlaps that of the best mean of the row; none where that has one "
@@ -38,62 +28,6 @@ BOLD_RULE = (
 
 # A probability from fewer comparisons of single runs says nothing.
 FEWEST_PAIRS = 5
-MIXED_PROTOCOLS = "The paper's baselines are copied from other papers, with other protocols."
-
-
-@dataclass(frozen=True)
-class TextTable:
-    """
-    Cells as text.
-
-    :param header: headings
-    :param rows: cells; ``**text**`` is bold
-    :param caption: where the numbers come from
-    """
-
-    header: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    caption: str
-
-    def markdown(self) -> str:
-        """
-        :return: table and caption
-        """
-        lines = [self.header, tuple("---" for _ in self.header), *self.rows]
-        return "\n".join("| " + " | ".join(cells) + " |" for cells in lines) + f"\n\n{self.caption}\n"
-
-    def latex(self) -> str:
-        """
-        :return: ``table`` environment; needs the package booktabs
-        """
-        lines = [r"\begin{table}", r"\centering", r"\begin{tabular}{l" + "r" * (len(self.header) - 1) + "}", r"\toprule"]
-        body = [" & ".join(_latex(cell) for cell in cells) + r" \\" for cells in (self.header, *self.rows)]
-        lines += [body[0], r"\midrule", *body[1:], r"\bottomrule", r"\end{tabular}"]
-        return "\n".join([*lines, rf"\caption{{{_latex(self.caption)}}}", r"\end{table}", ""])
-
-    def csv(self) -> str:
-        """
-        :return: cells without marks of bold
-        """
-        text = io.StringIO(newline="")
-        csv.writer(text).writerows([self.header, *([c.replace("**", "") for c in row] for row in self.rows)])
-        return text.getvalue()
-
-    def write(self, folder: Path, name: str, endings: Sequence[str] = ("md", "tex", "csv")) -> list[Path]:
-        """
-        :param folder: of the tables
-        :param name: of the files, without ending
-        :param endings: which files
-        :return: files
-        """
-        folder.mkdir(parents=True, exist_ok=True)
-        written = []
-        texts = {"md": self.markdown, "tex": self.latex, "csv": self.csv}
-        for ending in endings:
-            path, text = folder / f"{name}.{ending}", texts[ending]()
-            write_text(path, text)
-            written.append(path)
-        return written
 
 
 def score_table(evidence: Evidence) -> TextTable:
@@ -268,99 +202,6 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
     return TextTable(header, tuple(rows), f"{evidence.caption(ids, variants)} {note}")
 
 
-def runtime_table(evidence: Evidence) -> TextTable:
-    """
-    :param evidence: rows of whole agents
-    :return: seconds per 1000 updates beside the paper's, one row per agent, device and precision
-    """
-    rows = []
-    ids = [name for _, name in evidence.table_rows()]
-    for variant in evidence.experiment.variants:
-        if variant.paper is None:  # DCE again, with other numbers
-            continue
-        cell = paper_scores().get(("gym", "runtime-s", variant.paper))
-        printed = "-" if cell is None or cell.score is None else f"{cell.score:g}"
-        runs = run_times(evidence, variant, ids)
-        for device in sorted({run.device for run in runs}, key=lambda device: (" " in device, device)):
-            rates = np.array([run.seconds for run in runs if run.device == device])
-            spread = f"{rates.min():.1f} to {rates.max():.1f}"
-            settings = "fewer draws" if has_fewer_draws(evidence, variant) else ""
-            how = ", ".join(part for part in (device, settings) if part)
-            rows.append((variant.name, how, f"{np.median(rates):.1f}", spread, str(len(rates)), printed))
-    note = (
-        "Wall time with evaluations, of runs beside others: an order; benchmarks/results/speed.md measures. On a CPU, runs of "
-        f"up to {UPDATES_WORTH_COMPILING:,} steps are executed eagerly, longer ones compiled. Rounded products "
-        f"(bf16-matmul) and fewer draws make an agent faster than the paper's. {MIXED_PROTOCOLS}"
-    )
-    header = ("agent", "device and precision", "s per 1000 updates (median)", "range", "runs", "paper: s per 1000, RTX 3070")
-    return TextTable(header, tuple(rows), f"{evidence.caption(ids)} {note}")
-
-
-def has_fewer_draws(evidence: Evidence, variant: Variant) -> bool:
-    """
-    :param evidence: rows at a scale
-    :param variant: agent
-    :return: whether the scale makes each of its updates cheaper than the authors'
-    """
-    return "n_mc_dropout" in evidence.scale.set_for.get(variant.algo, {})
-
-
-HASTENED = tuple(name for name in PRECISIONS if name != "float32")
-
-
-class RunTime(NamedTuple):
-    """
-    :param seconds: per 1000 updates
-    :param device: and precision
-    :param hastened: whether rounded products or settings of the scale make it faster than the authors' agent in float32
-    """
-
-    seconds: float
-    device: str
-    hastened: bool
-
-    @property
-    def text(self) -> str:
-        """
-        :return: seconds and device
-        """
-        return f"{self.seconds:.1f} s ({self.device}{', fewer draws' if self.hastened and ' ' not in self.device else ''})"
-
-
-def run_times(evidence: Evidence, variant: Variant, dataset_ids: list[str]) -> list[RunTime]:
-    """
-    :param evidence: rows
-    :param variant: agent
-    :param dataset_ids: data
-    :return: of each complete run, whatever its length, that was trained alone: members of a population have its time together
-    """
-    # smoke scale has small networks
-    fewer, runs = has_fewer_draws(evidence, variant) or bool(evidence.scale.set), []
-    for name in dataset_ids:
-        rows = pd.concat([evidence.runs(variant, name), evidence.of_other_length(variant, name)])
-        alone = rows[(rows["metric"] == "seconds") & ~rows["device"].str.contains("population")]
-        for value, n_updates, device in zip(alone["value"], alone["n_updates"], alone["device"], strict=True):
-            runs.append(RunTime(1000.0 * value / n_updates, device, fewer or device.rpartition(" ")[2] in HASTENED))
-    return runs
-
-
-def fastest_runs(evidence: Evidence, names: Iterable[str]) -> dict[str, RunTime]:
-    """
-    :param evidence: rows
-    :param names: of variants
-    :return: of each variant the run that others disturbed least, of those with the authors' settings in float32; all on one
-        file and one kind of device, the one with most of them
-    """
-    ids = [dataset_id] if (dataset_id := evidence.id_of(None)) is not None else []
-    by_device: dict[str, dict[str, RunTime]] = {}
-    for name in names:
-        for run in run_times(evidence, evidence.experiment.variant(name), ids):
-            known = by_device.setdefault(run.device, {})
-            if not run.hastened and run.seconds <= known.get(name, run).seconds:
-                known[name] = run
-    return max(by_device.values(), key=len, default={})
-
-
 def long_table(evidence: Evidence) -> TextTable:
     """
     :param evidence: rows
@@ -396,11 +237,3 @@ def long_table(evidence: Evidence) -> TextTable:
             start = [name, source_of(name), variant.name, settings, length, str(len(scores)), str(lost)]
             rows.append((*start, *numbers, paper, *printed))
     return TextTable(header, tuple(rows), "")
-
-
-def _latex(text: str) -> str:
-    for sign in ("\\", "&", "%", "_", "#", "$", "{", "}"):
-        text = text.replace(sign, r"\textbackslash " if sign == "\\" else f"\\{sign}")
-    text = text.replace("±", r"$\pm$").replace("…", r"\dots{}").replace("`", "").replace(">", "$>$")
-    parts = text.split("**")
-    return "".join(rf"\textbf{{{part}}}" if i % 2 else part for i, part in enumerate(parts))

@@ -14,8 +14,8 @@ import numpy as np
 
 from sb3_dce.configuration import row_of
 from sb3_dce.dce_probe import PROBE_BETAS
+from sb3_dce.experiments.curves import probe_difference
 from sb3_dce.experiments.evidence import GAMMA, TAU, Evidence
-from sb3_dce.experiments.figures import probe_difference
 from sb3_dce.experiments.grid import Variant, source_of
 from sb3_dce.experiments.judging import (
     CLOSE,
@@ -38,8 +38,8 @@ from sb3_dce.experiments.judging import (
     values_of,
 )
 from sb3_dce.experiments.paper import PAPER_SEEDS
+from sb3_dce.experiments.run_times import fastest_runs
 from sb3_dce.experiments.statistics import sample_std
-from sb3_dce.experiments.tables import fastest_runs
 from sb3_dce.student import student_quantile
 from sb3_dce.theory import penalty_bound
 

@@ -30,8 +30,8 @@ from sb3_dce.numpy_policy import (
     PredictPolicy,
     RandomPolicy,
     Squash,
-    numpy_policy,
 )
+from sb3_dce.policy_parts import numpy_policy
 
 _SB3 = ("sac", "td3", "ddpg", "ppo", "a2c")
 _CONTRIB = ("tqc", "trpo", "crossq")

@@ -22,7 +22,7 @@ from sb3_dce.data.npz import arrays_from_npz, write_npz
 from sb3_dce.envs import make_env
 from sb3_dce.errors import CheckpointError, ConfigError
 from sb3_dce.files import write_atomically, write_text
-from sb3_dce.numpy_policy import numpy_policy
+from sb3_dce.policy_parts import numpy_policy
 from sb3_dce.recording.episodes import Arrays, EpisodeRunner, RecordingSpec, concatenate
 from sb3_dce.recording.policy_files import write_npz_policy
 
