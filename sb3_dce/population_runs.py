@@ -272,6 +272,7 @@ class BatchedRuns:
             if index not in self._diverged:
                 self._save_member(index, model, folder / _checkpoint(n), n)
         state = {"n_updates": n, "random_state": population.random_state(), "seconds": seconds, "diverged": self._diverged}
+        state["members"] = [folder.name for folder in self.folders]
         with write_atomically(self._state_path) as stream:
             th.save(state, stream)
         for folder in self.folders:
@@ -307,6 +308,14 @@ class BatchedRuns:
                 hint="Lower their learning_rate or raise beta.",
             )
         return results
+
+
+def members_of(state_file: Path) -> list[str]:
+    """
+    :param state_file: of a population that was interrupted
+    :return: names of its members' folders, in its order
+    """
+    return list(th.load(state_file, weights_only=True).get("members", ()))
 
 
 def _checkpoint(n_updates: int) -> str:

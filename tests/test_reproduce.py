@@ -10,7 +10,7 @@ import time
 import weakref
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -22,7 +22,7 @@ from result_rows import keys_of
 from rich.console import Console
 from update_tools import all_tensors, largest_difference
 
-from sb3_dce import OfflineDCE
+from sb3_dce import OfflineDCE, population_runs
 from sb3_dce.data import resolve, write_hdf5
 from sb3_dce.data.locate import DATASETS_VARIABLE, search
 from sb3_dce.dce_probe import PROBE_BETAS, OfflineDCEProbe
@@ -32,9 +32,9 @@ from sb3_dce.experiments import run as experiment_run
 from sb3_dce.experiments.grid import PlannedRun, Scale, expand, load_experiment
 from sb3_dce.experiments.probe import prepare_probe
 from sb3_dce.experiments.reproduce import Request, plan_runs, reproduce, scale_of
-from sb3_dce.experiments.run import execute, is_complete, populations
+from sb3_dce.experiments.run import execute, is_complete, population_file, populations
 from sb3_dce.population_runs import BatchedRuns
-from sb3_dce.run_files import RunSpec, read_divergence
+from sb3_dce.run_files import RunSpec, read_divergence, write_result
 from sb3_dce.runs import run
 from sb3_dce.training import load_any
 
@@ -233,6 +233,37 @@ def test_population_that_diverged_is_not_kept_while_others_are_trained(
     monkeypatch.setattr(experiment_run, "get_device", th.device)
     plan = small_plan("fig-sac", tmp_path, seeds=2)  # single runs are trained alone
     assert len(train(plan, device="cuda")) == len(alive) > 1
+
+
+def test_population_killed_while_it_writes_its_results_only_writes_the_rest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained: list[int] = []
+
+    def on_the_cpu(group: list[RunSpec], device: th.device, console: Console) -> None:
+        trained.append(len(group))
+        BatchedRuns(group, th.device("cpu"), "eager", QUIET, state_file=population_file(group)).run()
+
+    def killed_at_the_third(spec: RunSpec, folder: Path, *rest: Any) -> dict[str, Any]:
+        if len(list(folder.parent.glob("*/result.json"))) == 2:
+            raise KeyboardInterrupt
+        return write_result(spec, folder, *rest)
+
+    monkeypatch.setattr(experiment_run, "_train_group", on_the_cpu)
+    monkeypatch.setattr(experiment_run, "get_device", th.device)
+    plan = [r for r in small_plan("fig-beta", tmp_path, updates=4) if r.spec.algo == "dce"]
+    with monkeypatch.context() as patch:
+        patch.setattr(population_runs, "write_result", killed_at_the_third)
+        with pytest.raises(KeyboardInterrupt):
+            train(plan, device="cuda")
+    assert sum(is_complete(r.spec) for r in plan) == 2
+    grown = [r for r in small_plan("fig-beta", tmp_path, updates=4, seeds=2) if r.spec.algo == "dce"]
+    with monkeypatch.context() as patch:
+        patch.setattr(BatchedRuns, "_train_until_due", None)  # nothing is left to train
+        train(plan, device="cuda")
+    train(grown, device="cuda")
+    assert trained == [7, 7, 7] and all(is_complete(r.spec) for r in grown)
+    assert not list((tmp_path / "runs").glob("*.pt")) and not list((tmp_path / "runs").glob("*/checkpoint*"))
 
 
 def test_population_of_a_figure_writes_what_its_processes_would_write(tmp_path: Path) -> None:

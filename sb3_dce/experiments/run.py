@@ -22,13 +22,16 @@ from sb3_dce.experiments.grid import PlannedRun
 from sb3_dce.experiments.probe import prepare_probe
 from sb3_dce.launch import launch_all
 from sb3_dce.population import free_parameters
-from sb3_dce.population_runs import train_population
+from sb3_dce.population_runs import members_of, train_population
 from sb3_dce.run_files import RunSpec, read_divergence, read_result
 
 # More members than this are trained one population after the other. The second table is for agents that evaluate
 # their critics on many rows per sample: 10 x 100 of UWAC, 20 of PBRL's ten critics, 30 of CQL.
 MAX_MEMBERS = 64
 MAX_MEMBERS_OF = {"offline_uwac": 5, "offline_pbrl": 15, "offline_cql": 30}
+
+# Beside the folders of the members; a name for each population.
+STATE_FILES = "population-{}.pt"
 
 
 def execute(
@@ -57,7 +60,8 @@ def execute(
     first = [run.spec for run in wanted.values() if run.needs is None]
     after = [(run.spec, Path(run.needs)) for run in wanted.values() if run.needs is not None]
     device = get_device(device)
-    failures = _run_all(first, workers, device, ray_address, console)
+    everything = [run.spec for run in planned if run.needs is None]
+    failures = _run_all(first, everything, workers, device, ray_address, console)
     without = [best_policy for _, best_policy in after if read_divergence(best_policy) is not None]
     hint = "Take another --first-seed, or leave the probe out with --agents DCE."
     failures += [
@@ -73,7 +77,7 @@ def execute(
             except SB3DCEError as error:
                 failures.append(error)
     # A probe begins from a file on this machine, and is one model with five sets of critics: never batched.
-    failures += _run_all(prepared, workers, th.device("cpu"), None, console)
+    failures += _run_all(prepared, prepared, workers, th.device("cpu"), None, console)
     diverged = [str(error) for error in failures if isinstance(error, DivergenceError)]
     return diverged, [error for error in failures if not isinstance(error, DivergenceError)]
 
@@ -89,8 +93,14 @@ def is_complete(spec: RunSpec) -> bool:
 
 
 def _run_all(
-    specs: list[RunSpec], workers: int, device: th.device, ray_address: str | None, console: Console
+    specs: list[RunSpec],
+    planned: list[RunSpec],
+    workers: int,
+    device: th.device,
+    ray_address: str | None,
+    console: Console,
 ) -> list[BaseException]:
+    """``specs`` of those ``planned`` are to be trained; an interrupted population has members of which this is not asked."""
     if not specs:
         return []
     if ray_address is not None:
@@ -100,7 +110,9 @@ def _run_all(
     if device.type == "cpu":
         here = [replace(spec, device="cpu") for spec in specs]
         return [outcome for outcome in launch_all(here, workers, console) if isinstance(outcome, BaseException)]
-    groups = populations(specs)
+    begun = begun_populations(specs, planned)
+    taken = {spec.folder for group in begun for spec in group}
+    groups = [*begun, *populations(spec for spec in specs if spec.folder not in taken)]
     alone = [replace(group[0], device=str(device)) for group in groups if len(group) == 1]
     failures = [outcome for outcome in launch_all(alone, 1, console) if isinstance(outcome, BaseException)]
     for group in (group for group in groups if len(group) > 1):
@@ -116,6 +128,25 @@ def _run_all(
         gc.collect()
         th.cuda.empty_cache()
     return failures
+
+
+def begun_populations(specs: Sequence[RunSpec], planned: Sequence[RunSpec]) -> list[list[RunSpec]]:
+    """
+    Populations that were interrupted, as they were. One that was killed while it wrote its results has members that are
+    complete; without these the others would be another population and begin anew. So they would if a plan has grown.
+
+    :param specs: runs to train
+    :param planned: these and those that are complete
+    :return: members of each population that was to train some of ``specs`` and no run that is not planned
+    """
+    wanted, by_folder = {spec.folder for spec in specs}, {spec.folder: spec for spec in planned}
+    groups = []
+    for common in sorted({Path(folder).parent for folder in wanted}):
+        for path in sorted(common.glob(STATE_FILES.format("*"))):
+            folders = [str(common / name) for name in members_of(path)]
+            if wanted.intersection(folders) and by_folder.keys() >= set(folders):
+                groups.append([by_folder[folder] for folder in folders])
+    return groups
 
 
 def populations(specs: Iterable[RunSpec]) -> list[list[RunSpec]]:
@@ -139,7 +170,14 @@ def populations(specs: Iterable[RunSpec]) -> list[list[RunSpec]]:
     return cut
 
 
-def _train_group(group: list[RunSpec], device: th.device, console: Console) -> None:
+def population_file(group: Sequence[RunSpec]) -> str:
+    """
+    :param group: members of a population
+    :return: name of its state file, the same for the same members
+    """
     names = sorted(Path(spec.folder).name for spec in group)
-    state_file = f"population-{hashlib.sha256(' '.join(names).encode()).hexdigest()[:12]}.pt"
-    train_population(group, device=device, console=console, state_file=state_file)
+    return STATE_FILES.format(hashlib.sha256(" ".join(names).encode()).hexdigest()[:12])
+
+
+def _train_group(group: list[RunSpec], device: th.device, console: Console) -> None:
+    train_population(group, device=device, console=console, state_file=population_file(group))
