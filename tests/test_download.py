@@ -640,3 +640,14 @@ def test_command_downloads_and_refuses_with_one_message(folder: Path, host: Host
     host.faults.extend([status(404)] * 2)
     code, _, err = sb3_dce(*command, "--force")
     assert code == 2 and err.startswith("Error: ") and err.count("HTTP 404") == 2 and "Traceback" not in err
+
+
+def test_command_takes_a_hash_and_replaces_only_by_force(folder: Path, host: Host, payload: bytes) -> None:
+    command = ("datasets", "download", NAME, "--cache-dir", str(folder))
+    digest = hashlib.sha256(payload).hexdigest()
+    wrong = sb3_dce(*command, "--sha256", "0" * 64)
+    assert wrong.code == 2 and digest in wrong.stderr and FILE not in names(folder)
+    assert sb3_dce(*command, "--sha256", digest).code == 0
+    (folder / FILE).write_bytes(b"mine")
+    assert sb3_dce(*command).code == 2 and (folder / FILE).read_bytes() == b"mine"
+    assert sb3_dce(*command, "--force").code == 0 and (folder / FILE).read_bytes() == payload

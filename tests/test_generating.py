@@ -310,6 +310,28 @@ def test_command_says_what_it_uses(policies: Path, tmp_path: Path) -> None:
     assert "sac-Hopper.npz" in stdout and "60 rows" in stdout
 
 
+def test_command_makes_what_its_options_say(tmp_path: Path) -> None:
+    mine = write_policy(tmp_path / "mine.npz", (11, 3), seed=3)
+    options = ("--rows", "40", "--seed", "5", "--workers", "1", "--folder")
+    outcome = sb3_dce("datasets", "generate", "hopper-medium-sb3", "--policy", str(mine), *options, str(tmp_path / "command"))
+    assert outcome.code == 0, outcome.stderr
+    made = generate("hopper-medium-sb3", tmp_path / "python", Sources(policy=mine), rows=40, seed=5)
+    one, other = read(tmp_path / "command" / "hopper-medium-sb3.hdf5"), read(made.path)
+    assert all(np.array_equal(one[key], other[key]) for key in other)
+    buffer = ("--buffer", str(buffer_file(tmp_path / "buffer.hdf5")), "--folder", str(tmp_path))
+    outcome = sb3_dce("datasets", "generate", "hopper-medium-replay-sb3", *buffer)
+    assert outcome.code == 0, outcome.stderr
+    assert np.array_equal(
+        read(tmp_path / "hopper-medium-replay-sb3.hdf5")["rewards"], read(tmp_path / "buffer.hdf5")["rewards"]
+    )
+
+
+def test_command_trains_what_is_missing_as_it_is_told(tmp_path: Path) -> None:
+    told = ("--target", "4321", "--train-steps", "20", "--folder", str(tmp_path))
+    outcome = sb3_dce("datasets", "generate", "hopper-medium-sb3", *told)
+    assert outcome.code == 2 and "4321" in outcome.stderr and "20 steps" in outcome.stderr
+
+
 # -- the policies the roles name, where they are at hand -----------------------------------------------------------------
 
 # Return and length of one deterministic episode, seed 0, as published with the converted policies.

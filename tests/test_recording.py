@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 from commands import sb3_dce
 from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from typer.testing import CliRunner
 
 from sb3_dce import cli, load_dataset
@@ -406,3 +408,38 @@ def test_command_interrupted_while_it_writes_loses_nothing(tmp_path: Path, monke
 def test_help_warns_of_code_in_zip_files(command: str) -> None:
     result = CliRunner().invoke(cli.app, ["datasets", command, "--help"], env={"COLUMNS": "200"})
     assert result.exit_code == 0 and "runs code stored in it" in result.output
+
+
+def test_command_records_what_its_options_say(policy: Path, tmp_path: Path) -> None:
+    asked = ("--policy", str(policy), "--env", "Hopper-v4", "--workers", "1")
+    options = ("--seed", "3", "--deterministic", "--noise", "0.2", "--max-episode-steps", "15", "--next-observations")
+    outcome = sb3_dce("datasets", "record", *asked, *options, "--episodes", "3", "--out", str(tmp_path / "command.hdf5"))
+    assert outcome.code == 0, outcome.stderr
+    spec = RecordingSpec(
+        str(policy), "Hopper-v4", seed=3, deterministic=True, noise=0.2, max_episode_steps=15, next_observations=True
+    )
+    record(spec, tmp_path / "python.hdf5", n_episodes=3)
+    one, other = read(tmp_path / "command.hdf5"), read(tmp_path / "python.hdf5")
+    assert one.keys() == other.keys() >= {"next_observations"} and len(ends(one)) == 3
+    assert all(np.array_equal(one[key], other[key]) for key in one)
+    assert ends(one)[0] <= 14
+    other_rows = ("datasets", "record", *asked, "--steps", "9", "--out", str(tmp_path / "command.hdf5"))
+    assert sb3_dce(*other_rows).code == 2 and sb3_dce(*other_rows, "--force").code == 0
+    assert len(read(tmp_path / "command.hdf5")["rewards"]) == 9
+
+
+def test_command_reads_a_zip_file_as_it_is_told(tmp_path: Path) -> None:
+    env = VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")]), norm_reward=False)
+    model = PPO("MlpPolicy", env, n_steps=16, batch_size=16, n_epochs=1, seed=0, device="cpu").learn(32)
+    model.policy.action_net.weight.data.mul_(100.0)  # so that observations that are not normalised would be seen
+    model.save(tmp_path / "model.zip")
+    env.save(str(tmp_path / "vecnormalize.pkl"))
+    files = ("--policy", str(tmp_path / "model.zip"), "--vecnormalize", str(tmp_path / "vecnormalize.pkl"))
+    command = ("datasets", "record", *files, "--env", "Pendulum-v1", "--steps", "5", "--deterministic", "--workers", "1")
+    wrong = sb3_dce(*command, "--out", str(tmp_path / "wrong.hdf5"), "--algo", "sac")
+    assert wrong.code == 2 and not (tmp_path / "wrong.hdf5").exists()
+    right = sb3_dce(*command, "--out", str(tmp_path / "right.hdf5"), "--algo", "ppo")
+    assert right.code == 0, right.stderr
+    arrays = read(tmp_path / "right.hdf5")
+    expected, _ = model.predict(env.normalize_obs(arrays["observations"]), deterministic=True)
+    np.testing.assert_allclose(arrays["actions"], expected, atol=2e-4)  # the recorder rounds actions
