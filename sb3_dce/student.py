@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 # 97.5 % quantiles by degrees of freedom, 1 to 10.
@@ -18,6 +20,18 @@ def student_quantile(freedom: float) -> float:
     # nearly linear in the inverse
     known = 1.0 / np.arange(len(_QUANTILES), 0, -1)
     return float(np.interp(1.0 / freedom, known, _QUANTILES[::-1]))
+
+
+def welch_freedom(errors: Sequence[float], freedoms: Sequence[float]) -> float:
+    """
+    Degrees of freedom of the standard error of a difference of two means (Welch 1947).
+
+    :param errors: standard errors of the means, not all zero
+    :param freedoms: degrees of freedom of each
+    :return: of ``sqrt`` of the sum of the squared errors
+    """
+    squares = [error**2 for error in errors]
+    return sum(squares) ** 2 / sum(square**2 / freedom for square, freedom in zip(squares, freedoms, strict=True))
 
 
 def sample_std(values: np.ndarray) -> np.ndarray:

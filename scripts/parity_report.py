@@ -4,12 +4,13 @@ Do two ways of running one agent learn the same? Scores of two sets of runs on t
     python scripts/parity_report.py float32=runs/a bf16-matmul=runs/b docs/results/precision.md
 
 Each set is one or more folders (joined by ``+``) with one sub-folder per seed, as ``sb3-dce train`` writes them. The interval
-of the difference is that of a bootstrap over seeds, each set resampled by itself: the same seed in two precisions is two
-different trainings, since their numbers part within a few thousand updates. Writes the page and, beside it, a picture.
+of the difference is that of Welch's test over seeds, which are not paired: the same seed in two precisions is two different
+trainings, since their numbers part within a few thousand updates. Writes the page and, beside it, a picture.
 """
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 
@@ -20,8 +21,8 @@ import yaml
 from sb3_dce.data.locate import catalogue_id
 from sb3_dce.evaluation import Evaluation
 from sb3_dce.plots import plot_learning_curves
+from sb3_dce.student import sample_std, student_quantile, welch_freedom
 
-N_RESAMPLES = 10_000
 # Evaluations whose mean is the second measure: one last evaluation is a noisy thing.
 N_LAST = 5
 
@@ -48,12 +49,12 @@ def interval_of_difference(one: np.ndarray, other: np.ndarray) -> tuple[float, f
     """
     :param one: a score per seed
     :param other: a score per seed
-    :return: 95 % bootstrap interval of the mean of ``other`` minus that of ``one``
+    :return: 95 % interval of the mean of ``other`` minus that of ``one``, by Welch's test
     """
-    rng = np.random.default_rng(0)
-    means = [rng.choice(scores, (N_RESAMPLES, len(scores))).mean(axis=1) for scores in (one, other)]
-    low, high = np.percentile(means[1] - means[0], [2.5, 97.5])
-    return float(low), float(high)
+    errors = [float(sample_std(scores)) / math.sqrt(len(scores)) for scores in (one, other)]
+    freedom = welch_freedom(errors, [len(one) - 1, len(other) - 1])
+    difference, reach = float(other.mean() - one.mean()), student_quantile(freedom) * math.hypot(*errors)
+    return difference - reach, difference + reach
 
 
 def main() -> None:
@@ -95,7 +96,7 @@ def main() -> None:
             "",
             f"{title[0].upper()}{title[1:]}: {name_a} {one.mean():.2f} ± {one.std(ddof=1):.2f}, {name_b} {other.mean():.2f} ± "
             f"{other.std(ddof=1):.2f} (sample standard deviation over seeds); difference {other.mean() - one.mean():+.2f}, "
-            f"95 % interval {low:+.2f} to {high:+.2f}.",
+            f"95 % interval of Welch's test {low:+.2f} to {high:+.2f}.",
         ]
     picture = plot_learning_curves(
         {name_a: curves_a, name_b: curves_b}, Path(out).with_suffix(".png"), run["algo"], None, True

@@ -140,11 +140,25 @@ def test_written_rows_are_read_without_loss_and_always_in_the_same_bytes(made_up
 
 
 def test_run_in_two_files_counts_once(made_up: pd.DataFrame, tmp_path: Path) -> None:
-    changed = made_up.assign(value=made_up["value"] + 1.0, experiment="table1", code_version="0.2.0")
+    changed = made_up.assign(experiment="table1", code_version="0.2.0")
     results.write_rows(tmp_path / "a.csv.gz", made_up)
     results.write_rows(tmp_path / "b.csv.gz", changed)
     merged = results.read_folder(tmp_path)
     assert len(merged) == len(made_up) and set(merged["experiment"]) == {"fig-beta"}, "the first file counts, as a whole"
+
+
+def test_run_that_was_trained_again_for_more_episodes_counts(made_up: pd.DataFrame) -> None:
+    short = made_up.assign(experiment="run-times")
+    again = made_up.assign(value=made_up["value"].where(made_up["metric"] != "n_episodes", made_up["value"] + 6))
+    for parts in ([made_up, again], [again, made_up]):
+        merged = results.merge(parts)
+        assert len(merged) == len(made_up)
+        assert (
+            merged[merged["metric"] == "n_episodes"]["value"].tolist()
+            == again[again["metric"] == "n_episodes"]["value"].tolist()
+        )
+    assert set(results.merge([short, made_up])["experiment"]) == {"fig-beta"}, "a table would leave the other out"
+    assert set(results.merge([short])["experiment"]) == {"run-times"}
 
 
 def test_runs_on_two_versions_of_a_file_are_two_runs(made_up: pd.DataFrame) -> None:

@@ -25,10 +25,10 @@ from sb3_dce.experiments.grid import (
     source_of,
     variant_hash,
 )
+from sb3_dce.experiments.results import TIMING
 from sb3_dce.theory import beta_eff, shift_factor, value_shift_factor
 
 UPDATES_PER_EPOCH = 1000
-TIMING = "run-times"  # its runs are too short to say anything about scores
 TAIL = 0.1  # share of a run, from its end, that stands for what it has become
 GAMMA, TAU = 0.99, 0.005  # of all DCE runs of the figures (paper, common configuration)
 

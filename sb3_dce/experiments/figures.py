@@ -56,7 +56,7 @@ def draw(evidence: Evidence, folder: Path, name: str) -> list[Path]:
 
 def draw_profile(evidence: Evidence, part: str, folder: Path, name: str) -> list[Path]:
     """
-    Performance profile: the share of runs above a score, over the data on which all agents have runs.
+    Performance profile: the share of runs above a score, mean over the data sets on which all agents have runs.
 
     :param evidence: of a table
     :param part: of the table, one of :func:`~sb3_dce.experiments.tables.parts_of`
@@ -74,7 +74,7 @@ def draw_profile(evidence: Evidence, part: str, folder: Path, name: str) -> list
     for number, (agent, tasks) in enumerate(scores.items()):
         share = performance_profile(tasks, thresholds)
         axes.step(thresholds, share, color=f"C{number}", linewidth=1.4, label=agent)
-    axes.set(xlabel="normalised score", ylabel="share of runs above it", ylim=(-0.02, 1.02))
+    axes.set(xlabel="normalised score", ylabel="share of runs above it (mean over data)", ylim=(-0.02, 1.02))
     axes.set_title(
         f"{len(ids)} data set{'s' if len(ids) > 1 else ''}, {'D4RL' if part.startswith('D4RL') else 'made with this package'}",
         fontsize=10,

@@ -14,8 +14,9 @@ import numpy as np
 
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import Variant
+from sb3_dce.experiments.paper import PAPER_SEEDS, paper_score
 from sb3_dce.experiments.statistics import sample_std
-from sb3_dce.student import student_quantile
+from sb3_dce.student import student_quantile, welch_freedom
 
 HELD, NOT_HELD, CLOSE, UNTESTED = "held", "did not hold", "too close to tell", "could not be tested"
 
@@ -25,9 +26,12 @@ TENTH = "means over the last tenth of the run"
 SEED_STD = 4.2
 SEED_STD_FREEDOM = 4
 CLEARLY = (
-    "outside of the 95 % interval of Welch's test over seeds, where an agent with fewer than three has the largest "
-    f"standard deviation of any agent on these data, at least {SEED_STD:g} (DCE on HalfCheetah, five seeds)"
+    "outside of the 95 % interval of Welch's test over seeds, where an agent with fewer than three has the largest standard "
+    f"deviation of these: {SEED_STD:g} (DCE on HalfCheetah, five seeds), that of the paper's DCE on such data (five seeds), "
+    "those of the experiment's agents with two seeds or more on these data"
 )
+# Seeds from which on an agent's own deviation is taken.
+FEWEST_OWN = 3
 # Below this score a policy does not do its task, so that comparisons of it say nothing.
 WORKING = 5.0
 
@@ -52,10 +56,12 @@ class Uncertainty(NamedTuple):
     """
     :param error: standard error of a mean over seeds
     :param freedom: degrees of freedom of its estimate
+    :param borrowed: whether the deviation is that of other runs, so that it is no second estimate beside theirs
     """
 
     error: float
     freedom: float
+    borrowed: bool = False
 
 
 def judge(claim: str, rule: str, holds: bool | str | None, numbers: str) -> Verdict:
@@ -130,14 +136,20 @@ def uncertainty(evidence: Evidence, variant: Variant, dataset_id: str) -> Uncert
     :param evidence: rows
     :param variant: agent
     :param dataset_id: data
-    :return: of the mean of its last scores. One or two seeds say little on their spread: there it is the largest of all agents
-        on these data, from ``SEED_STD`` up
+    :return: of the mean of its last scores. One or two seeds say little on their spread: there it is the largest that is
+        known, see ``CLEARLY``
     """
     n = max(1, len(evidence.last(variant, dataset_id)))
-    if n > 2:
+    if n >= FEWEST_OWN:
         return Uncertainty(sample_std(evidence.last(variant, dataset_id)) / math.sqrt(n), n - 1)
-    known = [scores for v in evidence.experiment.variants if len(scores := evidence.last(v, dataset_id)) > 1]
-    return Uncertainty(max([SEED_STD, *map(sample_std, known)]) / math.sqrt(n), SEED_STD_FREEDOM)
+    known = [(SEED_STD, SEED_STD_FREEDOM)]
+    papers = {evidence.paper_id(dataset) for dataset, name in evidence.table_rows() if name == dataset_id}
+    cells = [paper_score(paper, "DCE") for paper in papers]
+    known += [(cell.std, PAPER_SEEDS - 1) for cell in cells if cell is not None and cell.std is not None]
+    others = [evidence.last(v, dataset_id) for v in evidence.experiment.variants]
+    known += [(sample_std(scores), len(scores) - 1) for scores in others if len(scores) > 1]
+    std, freedom = max(known)
+    return Uncertainty(std / math.sqrt(n), freedom, borrowed=True)
 
 
 def above(values: Values | None, first: str, second: str) -> bool | str | None:
@@ -159,12 +171,12 @@ def differs(difference: float, one: Uncertainty, other: Uncertainty) -> bool | s
     :param other: uncertainty of the second
     :return: whether it is positive, ``CLOSE`` within the 95 % interval of Welch's test
     """
-    squares = [each.error**2 for each in (one, other)]
-    variance = sum(squares)
-    if variance == 0.0:
+    error = math.hypot(one.error, other.error)
+    if error == 0.0:
         return CLOSE if difference == 0 else difference > 0
-    freedom = variance**2 / sum(s**2 / each.freedom for s, each in zip(squares, (one, other), strict=True))
-    return CLOSE if abs(difference) <= student_quantile(freedom) * math.sqrt(variance) else difference > 0
+    freedom = welch_freedom((one.error, other.error), (one.freedom, other.freedom))
+    freedom = min([freedom, *(each.freedom for each in (one, other) if each.borrowed)])
+    return CLOSE if abs(difference) <= student_quantile(freedom) * error else difference > 0
 
 
 def all_of(parts: Iterable[bool | str | None]) -> bool | str | None:

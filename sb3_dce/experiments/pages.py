@@ -52,7 +52,7 @@ def write_page(path: Path, out: Path, evidences: Mapping[str, Evidence], reports
         "The paper trains for 1,000,000 steps (500,000 in figures) with five seeds. How long and how often we did stands with "
         "each number. Its schedules change beta for the first time after 50,000 steps: shorter runs have the first beta "
         "throughout.",
-        f"Verdicts: {count(every)}.",
+        f"Verdicts in the sections of the experiments: {count(every)}.",
         f'In the rules below "clearly" means {CLEARLY}.',
         "## The paper's claims",
         claim_table(evidences, judged).markdown(),
@@ -73,7 +73,7 @@ def _section(name: str, evidence: Evidence, report: Report, link: str) -> list[s
     for part in parts_of(evidence):
         if f"aggregates-{part}" in report.tables:
             parts += ["### Performance profile", f"![Performance profile]({link}figures/{name}-profile-{part}.png)"]
-            parts += ["Share of all runs above a score, over the data of the aggregates above."]
+            parts += ["Share of the runs above a score, its mean over the data sets of the aggregates above."]
     if report.has_figure:
         parts += [f"![{experiment.title}]({link}figures/{name}.png)", report.caption]
     elif experiment.panels:

@@ -48,6 +48,8 @@ COLUMNS = (
 # What makes a run the same run.
 RUN_KEY = ["dataset", "dataset_sha256", "agent", "config_hash", "n_updates", "seed"]
 PLAN_KEY = ["dataset", "agent", "config_hash", "n_updates", "seed"]
+# Its runs are too short, or evaluated too little, to say anything about scores.
+TIMING = "run-times"
 # Diagnostics that figures, verdicts and the search for causes read, by their names in the log.
 CURVES = ("q_data", "q_policy", "value", "gap_td", "ent_coef", "beta_eff", "survival_margin", "action_dist", "entropy", "adv")
 PROBE_CURVE = re.compile(r"probe\d+_(data|policy|init|best|max|min)")
@@ -124,17 +126,21 @@ def planned_rows(planned: Iterable[PlannedRun]) -> pd.DataFrame:
 
 def merge(parts: Iterable[pd.DataFrame]) -> pd.DataFrame:
     """
-    :param parts: rows; where two hold the same run, the first counts
+    :param parts: rows; where several hold the same run, that with the most episodes at its end counts, one made for
+        :data:`TIMING` only if there is no other, and of equals the first
     :return: all rows, each run once
     """
-    kept: list[pd.DataFrame] = []
-    known: set[tuple[Any, ...]] = set()
-    for part in parts:
-        keys = pd.Series(list(part[RUN_KEY].itertuples(index=False, name=None)), index=part.index, dtype=object)
-        kept.append(part[~keys.isin(known)])
-        known |= set(keys)
-    filled = [part for part in kept if len(part)]
-    return _ordered(pd.concat(filled, ignore_index=True)) if filled else empty()
+    filled = [part for part in parts if len(part)]
+    if not filled:
+        return empty()
+    every = pd.concat(filled, ignore_index=True)
+    runs, part_of = every.groupby(RUN_KEY, sort=False).ngroup(), np.repeat(np.arange(len(filled)), [len(p) for p in filled])
+    copies = pd.DataFrame({"run": runs, "part": part_of, "timing": every["experiment"] == TIMING})
+    copies["episodes"] = np.where(every["metric"] == "n_episodes", every["value"], 0.0)
+    best = copies.groupby(["run", "part"], as_index=False).max()
+    best = best.sort_values(["run", "timing", "episodes", "part"], ascending=[True, True, False, True])
+    taken = best.drop_duplicates("run").set_index("run")["part"]
+    return _ordered(every[runs.map(taken).to_numpy() == part_of])
 
 
 def without(rows: pd.DataFrame, others: pd.DataFrame) -> pd.DataFrame:

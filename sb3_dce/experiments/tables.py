@@ -7,7 +7,7 @@ import numpy as np
 from sb3_dce.data.catalog import resolve
 from sb3_dce.experiments.evidence import Evidence, at_end, curve_of
 from sb3_dce.experiments.grid import Variant, source_of, variant_hash
-from sb3_dce.experiments.paper import MIXED_PROTOCOLS, paper_score
+from sb3_dce.experiments.paper import MIXED_PROTOCOLS, paper_score, paper_total
 from sb3_dce.experiments.statistics import (
     N_RESAMPLES,
     Interval,
@@ -23,7 +23,8 @@ from sb3_dce.experiments.text_table import TextTable
 
 BOLD_RULE = (
     "Bold: the 95 % interval over seeds (Student's t) overlaps that of the best mean of the row; none where that has one "
-    "seed. ± is the sample standard deviation over seeds. 'After n' are runs of another length than those of the row."
+    "seed. ± is the sample standard deviation over seeds, whose number stands where it differs from the row's commonest. "
+    "'After n' are runs of another length than those of the row."
 )
 
 # A probability from fewer comparisons of single runs says nothing.
@@ -35,7 +36,7 @@ def score_table(evidence: Evidence) -> TextTable:
     Scores of all agents on all data, and the paper's beside them.
 
     :param evidence: of an experiment with a table
-    :return: one row per file; a dataset of the paper without results is a row "not run" or "no data"
+    :return: one row per file; a dataset of the paper without results is a row "not run" or "no data"; totals
     """
     variants = list(evidence.experiment.variants)
     methods = [v.paper for v in variants if v.paper is not None]
@@ -48,11 +49,14 @@ def score_table(evidence: Evidence) -> TextTable:
         if not ids and evidence.scale.source != "embedded":
             rows.append((f"{dataset.twin or dataset.paper}: {dataset.absence}", *("" for _ in variants), paper, *printed))
         for name in ids:
-            best = _best_interval([evidence.last(v, name) for v in variants])
-            cells = tuple(score_cell(evidence, v, name, best) for v in variants)
+            columns = [evidence.last(v, name) for v in variants]
+            best, counts = _best_interval(columns), [len(scores) for scores in columns if len(scores)]
+            usual = max(counts, key=lambda n: (counts.count(n), n), default=0)
+            cells = tuple(score_cell(evidence, v, name, best, usual) for v in variants)
             note = f" ({dataset.note})" if dataset.note and name == dataset.twin else ""
             rows.append((f"{name}{note}", *cells, paper, *printed))
     ids = [name for _, name in evidence.table_rows()]
+    rows += _total_rows(evidence, methods)
     tuned = (
         "DCE has the paper's row of each dataset; the paper tuned these by evaluating online. 'One setting' has its commonest "
         "row everywhere."
@@ -60,12 +64,37 @@ def score_table(evidence: Evidence) -> TextTable:
     return TextTable(header, tuple(rows), f"{evidence.caption(ids)} {BOLD_RULE} {tuned} {MIXED_PROTOCOLS}")
 
 
-def score_cell(evidence: Evidence, variant: Variant, dataset_id: str, best: Interval | None) -> str:
+def _total_rows(evidence: Evidence, methods: list[str]) -> list[tuple[str, ...]]:
+    """By family and source a sum over all its sets, ours where an agent has run on all of them; the paper's as printed."""
+    found = []
+    datasets = evidence.experiment.datasets if evidence.scale.source != "embedded" else ()
+    for family in dict.fromkeys(resolve(dataset.paper).family for dataset in datasets):
+        wanted = [dataset for dataset in datasets if resolve(dataset.paper).family == family]
+        printed = {method: paper_total(method, [dataset.paper for dataset in wanted]) for method in methods}
+        paper = tuple(
+            "-" if t is None else f"{t.mean:.1f}" + (f" ± {t.paper_std:.1f}" if t.paper_std else "") for t in printed.values()
+        )
+        for source in ("D4RL", "sb3"):
+            ids = [name for dataset in wanted for name in evidence.ids(dataset) if source_of(name) == source]
+            if source == "sb3" and not ids:
+                continue
+            totals = []
+            for variant in evidence.experiment.variants:
+                scores = [evidence.last(variant, name) for name in ids]
+                whole = len(ids) == len(wanted) and all(map(len, scores))
+                totals.append(f"{sum(task.mean() for task in scores):.1f}" if whole else "-")
+            label = f"total of {len(wanted)} {family} sets, {'D4RL' if source == 'D4RL' else 'our own'}"
+            found.append((label, *totals, "", *(paper if source == "D4RL" else ("",) * len(paper))))
+    return found
+
+
+def score_cell(evidence: Evidence, variant: Variant, dataset_id: str, best: Interval | None, usual: int) -> str:
     """
     :param evidence: rows
     :param variant: column
     :param dataset_id: row
     :param best: interval of the best mean of the row, ``None`` if that has one seed
+    :param usual: commonest number of seeds of the row
     :return: mean, deviation, number of seeds if it is not the usual one, and how many diverged
     """
     scores, diverged = evidence.last(variant, dataset_id), evidence.n_diverged(variant, dataset_id)
@@ -78,6 +107,8 @@ def score_cell(evidence: Evidence, variant: Variant, dataset_id: str, best: Inte
     text = _mean_and_spread(scores)
     if best is not None and len(scores) > 1 and mean_interval(scores).overlaps(best):
         text = f"**{text}**"
+    if len(scores) != usual:
+        text += f" ({len(scores)} seed{'s' if len(scores) > 1 else ''})"
     return text + lost
 
 
@@ -226,7 +257,7 @@ def long_table(evidence: Evidence) -> TextTable:
                 few = at_end(runs, "score_paper_episodes")
                 curve = curve_of(runs, "score")
                 paper_mode = float(few.mean()) if len(few) else float("nan")
-                last_ten = float(curve.tail(10).mean().mean()) if len(curve) > 10 else float("nan")
+                last_ten = float(curve.tail(10).mean().mean()) if len(curve) >= 10 else float("nan")
                 late = (last_ten, float(curve.max().mean()))
                 values = (float(scores.mean()), sample_std(scores), low, high, paper_mode, *late)
                 numbers = ["" if np.isnan(v) else f"{v:.4f}" for v in values] + [" ".join(f"{s:.4f}" for s in scores)]
