@@ -27,10 +27,17 @@ from sb3_dce.data.loading import DatasetLike as DatasetLike
 from sb3_dce.data.locate import is_path
 from sb3_dce.data.minari import is_minari_name
 from sb3_dce.envs import SpacesEnv, dataset_spaces, make_env_if_possible, own_env
-from sb3_dce.errors import ConfigError, DatasetIntegrityError, DatasetSemanticsError, DatasetWarning, SB3DCEWarning
+from sb3_dce.errors import (
+    ConfigError,
+    DatasetIntegrityError,
+    DatasetNotFoundError,
+    DatasetSemanticsError,
+    DatasetWarning,
+    SB3DCEWarning,
+)
 from sb3_dce.networks import StandardizedExtractor
 from sb3_dce.normalizing import FEWEST_OBSERVATIONS, is_untouched, vec_normalize_of
-from sb3_dce.sb3_checks import check_env_fits
+from sb3_dce.sb3_checks import check_env_fits, check_one_env, named_env
 
 SelfAttaching = TypeVar("SelfAttaching", bound="AttachingMixin")
 
@@ -47,6 +54,8 @@ class AttachingMixin(OffPolicyAlgorithm):
     reward_shift: float
     # Filled at attach, saved with the model: what diagnostics and reward scaling need to know of the data.
     dataset_statistics: dict[str, Any] | None
+    # Saved: range of returns behind the factor on the rewards, where the data have been replaced since.
+    trained_return_range: float | None
     _transitions: Transitions | None
     # Saved: mean and variance of the VecNormalize it was trained behind; with others a model is not what was trained.
     vec_normalize_statistics: tuple[np.ndarray, np.ndarray] | None = None
@@ -78,31 +87,30 @@ class AttachingMixin(OffPolicyAlgorithm):
             raise ConfigError("two datasets are given", key="dataset", hint=hint)
         hyperparams.check_keys(cls, overrides, where=f"{cls.__name__}.load_dataset", zoo_keys=False)
         name = as_dataset(name)
-        spec = None if isinstance(name, Transitions) else find_file(name)[1]
+        spec = _spec_of(name) if isinstance(name, Transitions) else find_file(name)[1]
         row = hyperparams.load_row(_algo_with_rows(cls), None if spec is None else spec.id)
         arguments = {**hyperparams.split_row(row).kwargs, **overrides}
         hyperparams.check_keys(cls, arguments, where=f"zoo_hyperparams/{cls.algo_name}.yml")
         arguments["dataset"] = name
         arguments["policy"] = policy or arguments.get("policy", "MlpPolicy")
+        file = name.info.path if isinstance(name, Transitions) else name
         if env is None and spec is not None:
             env = make_env_if_possible(spec.id)
-        elif env is None and not isinstance(name, Transitions):
-            env = own_env(os.fspath(name))
+        elif env is None and file is not None:
+            env = own_env(os.fspath(file))
         return cls(env=env, **arguments)  # type: ignore[arg-type]
 
-    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+    def set_env(self, env: GymEnv | str, force_reset: bool = True) -> None:
         """
         Evaluate in another environment, whose bounds of observations the model takes over.
 
-        :param env: one environment, with observations of the same shape and with the actions of the model
+        :param env: one environment, or the id of one, with observations of the same shape and with the actions of the model
         :param force_reset: kept for Stable-Baselines3
         :raises ConfigError: if its spaces are others, or it consists of several
         """
         without_simulator = isinstance(env, SpacesEnv)
-        env = self._wrap_env(env, self.verbose)
-        if env.num_envs != 1:
-            hint = "Give one; evaluate_policy(model, vec_env) and EvalCallback(vec_env) take several."
-            raise ConfigError(f"the model wants one environment, got {env.num_envs} in one", key="env", hint=hint)
+        env = self._wrap_env(named_env(env, self.verbose), self.verbose)
+        check_one_env(env)
         hint = "Use an environment with the spaces of the data, or read the data with its bounds (action_scale=)."
         check_env_fits(self, env, hint)
         for owner in (self, getattr(self, "policy", None)):
@@ -118,13 +126,27 @@ class AttachingMixin(OffPolicyAlgorithm):
 
     def set_dataset(self, dataset: DatasetLike) -> None:
         """
-        Train on other data from the next ``learn()`` on.
+        Train on other data from the next ``learn()`` on. A model that has been trained keeps what its networks have learned
+        with: mean and deviation of the observations (``normalize_obs``) and the factor on the rewards
+        (``reward_normalization``) stay those of the data before.
 
         :param dataset: as for :meth:`load_dataset`
         """
         self._remember_dataset(dataset)
-        self._own_buffer().reset()
+        if isinstance(self.replay_buffer, OfflineReplayBuffer):
+            self.replay_buffer.reset()
+        else:
+            self._make_buffer()
+        self.forget_rows()
+
+    def forget_rows(self) -> None:
+        """Let other rows come, without the complaint that they are not those of the training so far."""
+        if self._n_updates > 0 and self.dataset_statistics is not None:
+            self.trained_return_range = self.dataset_statistics.get("return_range")
         self.dataset_statistics = None
+
+    def _make_buffer(self) -> None:
+        self.replay_buffer = OfflineReplayBuffer(1, self.observation_space, self.action_space, self.device)
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """
@@ -132,8 +154,9 @@ class AttachingMixin(OffPolicyAlgorithm):
 
         :param path: file
         """
-        if self.dataset is not None:
+        if self.dataset is not None or self._transitions is not None:
             self.attach_dataset()
+        if self.dataset is not None:
             rows = self._own_buffer().rows
             size = 0.0 if rows is None else rows.nbytes / 1e6
             text = f"the replay buffer ({size:,.0f} MB) is a copy of {self.dataset}, which a loaded model reads by itself"
@@ -149,9 +172,9 @@ class AttachingMixin(OffPolicyAlgorithm):
         """
         super().load_replay_buffer(path, truncate_last_traj)
         if not isinstance(self.replay_buffer, OfflineReplayBuffer):
-            transitions = Transitions.from_replay_buffer(self.replay_buffer)
-            self.replay_buffer = OfflineReplayBuffer(1, self.observation_space, self.action_space, self.device)
-            self.set_dataset(transitions)
+            self.set_dataset(Transitions.from_replay_buffer(self.replay_buffer))
+        elif (known := self.dataset_statistics) is not None and known.get("sample_hash") != self.replay_buffer.sample_hash():
+            self.forget_rows()
 
     def _own_buffer(self) -> OfflineReplayBuffer:
         if not isinstance(self.replay_buffer, OfflineReplayBuffer):
@@ -218,14 +241,23 @@ class AttachingMixin(OffPolicyAlgorithm):
                     hint="Pass dataset=<id or file> to the constructor (in a YAML row: dataset: '<id>'), or call "
                     "model.set_dataset(<id or file>).",
                 )
-            options: dict[str, Any] = {}
-            if hasattr(self, "action_space"):  # not yet while the spaces themselves are read from the data
-                space = self.action_space
-                assert isinstance(space, spaces.Box)
-                self._refuse_other_width(space)
-                options = {"action_low": space.low.reshape(-1), "action_high": space.high.reshape(-1)}
-            self._transitions = load_transitions(self.dataset, d4rl_compat=self.d4rl_compat, **options)
+            try:
+                self._transitions = self._read_dataset(self.dataset)
+            except DatasetNotFoundError as error:
+                if self._n_updates > 0:
+                    moved = "If the data have moved: model.set_dataset(<new path>), or load(<model>, dataset=<new path>)."
+                    error.hint = f"{moved} {error.hint}"
+                raise
         return self._transitions
+
+    def _read_dataset(self, dataset: str) -> Transitions:
+        options: dict[str, Any] = {}
+        if hasattr(self, "action_space"):  # not yet while the spaces themselves are read from the data
+            space = self.action_space
+            assert isinstance(space, spaces.Box)
+            self._refuse_other_width(space)
+            options = {"action_low": space.low.reshape(-1), "action_high": space.high.reshape(-1)}
+        return load_transitions(dataset, d4rl_compat=self.d4rl_compat, **options)
 
     def _refuse_other_width(self, space: spaces.Box) -> None:
         """What the catalogue knows of the data is said before they are read with bounds that cannot fit."""
@@ -248,11 +280,9 @@ class AttachingMixin(OffPolicyAlgorithm):
         if buffer.size() > 0:
             if self.dataset_statistics is None:  # filled by load_replay_buffer() or add()
                 self._take_statistics_of(buffer)
-                if self.dataset is not None and buffer.n_added:
-                    warnings.warn(
-                        f"training on {buffer.size():,} rows that were added to the replay buffer; {self.dataset} is not read",
-                        DatasetWarning,
-                    )
+                if self.dataset is not None:
+                    how = "that were added to the replay buffer" if buffer.n_added else "of the replay buffer"
+                    warnings.warn(f"training on {buffer.size():,} rows {how}; {self.dataset} is not read", DatasetWarning)
             return
         transitions, known = self._load_transitions(), self.dataset_statistics
         buffer.attach(transitions, self.chosen_rows(transitions))
@@ -261,7 +291,7 @@ class AttachingMixin(OffPolicyAlgorithm):
             "rows": buffer.size(),
             "reward_mean": float(info.reward_mean),
             "reward_abs_max": float(max(abs(info.reward_min), abs(info.reward_max))),
-            "return_range": info.return_range,
+            "return_range": info.return_range if self.trained_return_range is None else self.trained_return_range,
             "n_terminals": int(info.n_terminals),
             "sample_hash": buffer.sample_hash(),
         }
@@ -278,8 +308,7 @@ class AttachingMixin(OffPolicyAlgorithm):
             warnings.warn(text, DatasetWarning)
         for text in self.check_dataset_fits(self._mean_reward(), info.n_terminals):
             warnings.warn(text, DatasetWarning)
-        if self.normalize_obs:
-            self._standardize(buffer.observations)
+        self._standardize(buffer.observations)
         self._transitions = None  # the buffer holds the rows now
 
     def chosen_rows(self, transitions: Transitions) -> np.ndarray | None:
@@ -290,17 +319,17 @@ class AttachingMixin(OffPolicyAlgorithm):
         return None
 
     def _take_statistics_of(self, buffer: OfflineReplayBuffer) -> None:
-        """What can be known without the episodes: the range of their returns is not, which reward scaling will say."""
+        """What can be known without the episodes: the range of their returns is not, which reward scaling would say."""
         rewards = buffer.rewards[: buffer.size()]
         self.dataset_statistics = {
             "rows": buffer.size(),
             "reward_mean": float(rewards.mean(dtype=np.float64)),
             "reward_abs_max": float(np.abs(rewards).max()),
-            "return_range": 0.0,
             "n_terminals": int(buffer.dones[: buffer.size()].sum()),
         }
-        if self.normalize_obs:
-            self._standardize(buffer.observations[: buffer.size()])
+        if self.trained_return_range is not None:
+            self.dataset_statistics["return_range"] = self.trained_return_range
+        self._standardize(buffer.observations[: buffer.size()])
 
     def _prepare_vec_normalize(self) -> None:
         """
@@ -355,7 +384,7 @@ class AttachingMixin(OffPolicyAlgorithm):
         """Factor on the rewards of the data."""
         if self.reward_normalization is None:
             return self.reward_scale
-        span = 0.0 if self.dataset_statistics is None else self.dataset_statistics["return_range"]
+        span = 0.0 if self.dataset_statistics is None else self.dataset_statistics.get("return_range", 0.0)
         if span <= 0.0:
             raise DatasetSemanticsError(
                 "return range is 0: reward_normalization='iql' divides by the largest minus the smallest episode return",
@@ -365,6 +394,9 @@ class AttachingMixin(OffPolicyAlgorithm):
         return self.reward_scale * 1000.0 / span
 
     def _standardize(self, observations: np.ndarray) -> None:
+        """Give the networks mean and deviation of the data, unless they have learned with others."""
+        if not self.normalize_obs or self._n_updates > 0:
+            return
         # Each network has its own extractor, and the moving averages cover parameters only: all get the statistics.
         mean = th.as_tensor(observations.mean(axis=0, dtype=np.float64).reshape(-1))
         std = th.as_tensor(observations.std(axis=0, dtype=np.float64).reshape(-1))
@@ -380,6 +412,16 @@ def as_dataset(source: DatasetLike) -> str | os.PathLike[str] | Transitions:
     :raises ConfigError: if it holds none
     """
     return source if isinstance(source, str | os.PathLike | Transitions) else load_dataset(source)
+
+
+def _spec_of(transitions: Transitions) -> DatasetSpec | None:
+    """The entry of the file that they were read from, if their actions have the bounds of its environment."""
+    spec = None if transitions.info.path is None else find_file(transitions.info.path)[1]
+    if spec is None:
+        return None
+    bounds, own = dataset_spaces(spec)[1], (transitions.info.action_space_low, transitions.info.action_space_high)
+    same = all(np.array_equal(a, b) for a, b in zip((bounds.low, bounds.high), own, strict=True))
+    return spec if same else None
 
 
 def _algo_with_rows(cls: type) -> str:

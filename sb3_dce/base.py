@@ -38,9 +38,11 @@ from sb3_dce.sb3_checks import (
     check_device,
     check_flags,
     check_logging,
+    check_one_env,
     check_spaces,
     named_env,
     policy_arguments,
+    python_number,
 )
 from sb3_dce.state import LearnedNumber, Storage, TrainState
 
@@ -116,20 +118,20 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         seed = check_seed(seed)
         check_device(device)
         check_logging(verbose, stats_window_size, tensorboard_log)
-        if isinstance(learning_rate, np.number):  # Stable-Baselines3 takes Python's numbers only
-            learning_rate = float(learning_rate)
         self.d4rl_compat = d4rl_compat
         spec = self._remember_dataset(dataset)
         if env is None and needs_env:
             env = self._spaces_env(spec, verbose)
         if env is not None:
             env = named_env(env, verbose)
+            if isinstance(env, VecEnv):
+                check_one_env(env)
             if isinstance(env, (gym.Env, VecEnv)):  # Stable-Baselines3 says what else it takes
                 check_spaces(env.observation_space, env.action_space)
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]
-            learning_rate,
+            python_number(learning_rate),
             learning_starts=0,
             batch_size=batch_size,
             tau=tau,
@@ -153,7 +155,7 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         self.reward_shift = reward_shift
         self.execution = execution
         self.precision = precision
-        self.dataset_statistics = None
+        self.dataset_statistics, self.trained_return_range = None, None
         self._engine: Engine[TrainState] | None = None
         self._generator: th.Generator | None = None
         self._coef: dict[str, th.Tensor] = {}
@@ -280,6 +282,7 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
     def _setup_model(self) -> None:
         self.check_parameters()
         self._stats_window_size = self.stats_window_size
+        self.learning_rate = python_number(self.learning_rate)
         given, settings = self.policy_kwargs, self.policy_settings()
         self.policy_kwargs = policy_arguments(given, self.policy_class, settings)
         try:
@@ -464,13 +467,15 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         callback.on_training_start(locals(), globals())
         keep_going = True
         while keep_going and self.num_timesteps < total_timesteps:
-            chunk = min(self.gradient_steps, total_timesteps - self.num_timesteps)
+            # up to the next multiple, where callbacks are due: a run may begin or have been interrupted between two
+            chunk = self.gradient_steps - self.num_timesteps % self.gradient_steps
+            chunk = min(chunk, total_timesteps - self.num_timesteps)
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
             timesteps, updates = self.num_timesteps, self._n_updates
             try:
                 self.train(gradient_steps=chunk, batch_size=self.batch_size)
                 keep_going = self._count_steps(chunk, callback, log_interval)
-            except KeyboardInterrupt:
+            except BaseException:
                 self.num_timesteps = timesteps + self._n_updates - updates  # what is saved now can go on
                 raise
         self._refuse_divergence()  # a run may be shorter than the intervals of the log

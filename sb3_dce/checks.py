@@ -21,7 +21,7 @@ def check_number(
     open_low: bool = False,
     open_high: bool = False,
     integer: bool = False,
-    hint: str | None = None,
+    hint: str = "Leave it out for the default.",
 ) -> None:
     """
     :param name: name of the parameter

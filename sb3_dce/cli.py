@@ -18,7 +18,7 @@ from sb3_dce.checks import LAST_SEED, check_steps
 from sb3_dce.cli_datasets import DatasetArgument
 from sb3_dce.errors import ConfigError, SB3DCEError
 from sb3_dce.messages import show_warnings_as_lines
-from sb3_dce.processes import usable_cores
+from sb3_dce.processes import Terminated, usable_cores
 
 app = typer.Typer(
     help="Offline reinforcement learning for people who know Stable-Baselines3.",
@@ -285,7 +285,7 @@ def _parse_lengths(pairs: list[str]) -> dict[str, int]:
 def main() -> None:
     """
     Entry point: errors of this package are one message on stderr and exit code 2, others exit code 1 and a report in a file;
-    never a traceback. Ctrl-C is exit code 130, typer's.
+    never a traceback. Ctrl-C is exit code 130, typer's, and SIGTERM 143, as shells have it.
     """
     show_warnings_as_lines()
     for stream in (sys.stdout, sys.stderr):  # an encoding without a sign such as ± is no reason to end a training
@@ -293,6 +293,11 @@ def main() -> None:
             stream.reconfigure(errors="replace")
     try:
         app()
+    except SystemExit as ended:
+        interrupted = ended.__context__
+        while interrupted is not None and not isinstance(interrupted, Terminated):
+            interrupted = interrupted.__context__
+        sys.exit(ended.code if interrupted is None else 143)
     except SB3DCEError as error:
         Console(stderr=True, highlight=False, soft_wrap=True).print(f"Error: {error}", markup=False)
         sys.exit(2)

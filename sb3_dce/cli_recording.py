@@ -82,12 +82,12 @@ def record_dataset(
     The rows depend on the policy, the environment and the seed, not on the number of processes. Interrupted, the same command
     goes on.
     """
-    from sb3_dce.data.locate import search_folders
+    from sb3_dce.data.locate import cache_folder, search_folders
     from sb3_dce.recording import RecordingSpec, record
 
     if out is None:
         stem = name or f"{env.rpartition(':')[2].rpartition('/')[2]}-{Path(policy).stem}-sb3".lower().replace("_", "-")
-        out = search_folders()[0] / f"{stem}.hdf5"
+        out = (search_folders() or [cache_folder()])[0] / f"{stem}.hdf5"
     spec = RecordingSpec(
         policy,
         env,

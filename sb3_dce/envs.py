@@ -27,8 +27,8 @@ from sb3_dce.data import catalog
 from sb3_dce.data.catalog import DatasetSpec
 from sb3_dce.data.file_checks import HDF5_SIGNATURE
 from sb3_dce.data.hdf5 import D4RLFile
-from sb3_dce.data.locate import known_dataset
-from sb3_dce.data.minari import environment_spec, find_minari, is_minari_name
+from sb3_dce.data.locate import is_path, known_dataset
+from sb3_dce.data.minari import environment_spec, find_minari, folder_of, is_minari_name
 from sb3_dce.errors import ConfigError
 from sb3_dce.files import expanded
 from sb3_dce.robotics import KITCHEN_ROBOT_NOISE_RATIO, KitchenObservation, fix_adroit, fix_kitchen_joint_types, kitchen_tasks
@@ -164,10 +164,10 @@ def own_env(name_or_path: str) -> gym.Env | None:
     """
     Environment of data outside of the catalogue, as they themselves say.
 
-    :param name_or_path: file, or ``minari:`` and an id of Minari
+    :param name_or_path: file or folder, or ``minari:`` and an id of Minari
     :return: an environment that can be stepped, or ``None``
     """
-    if is_minari_name(name_or_path):
+    if is_minari_name(name_or_path) or folder_of(name_or_path) is not None:
         return make_minari_env(name_or_path)
     path = expanded(name_or_path)
     return make_recorded_env(path) if os.path.isfile(path) else None
@@ -178,7 +178,7 @@ def make_minari_env(name: str) -> gym.Env | None:
     Environment of a dataset of Minari: the one that Gymnasium itself knows by the id in the metadata. They may also name
     code, arguments and wrappers; nothing of this is used, and where it differs from Gymnasium's own entry there is none.
 
-    :param name: ``minari:`` and an id of Minari
+    :param name: ``minari:`` and an id of Minari, or a path of such a dataset
     :return: an environment that can be stepped, or ``None``
     """
     recorded = environment_spec(find_minari(name))
@@ -244,7 +244,8 @@ def dataset_of_env(env_id: str) -> DatasetSpec | None:
 
 def make_recorded_env(path: str | PathLike[str]) -> gym.Env | None:
     """
-    Environment of a file that this package has recorded: the one that Gymnasium itself knows by the id in its attributes.
+    Environment of a file that this package has recorded: that of the dataset, or the one that Gymnasium itself knows, whose
+    id is in its attributes, with the time limit of the recording.
 
     :param path: file of a dataset
     :return: an environment that can be stepped, or ``None``; also if the file is none of ours, or has rows of other widths
@@ -255,15 +256,22 @@ def make_recorded_env(path: str | PathLike[str]) -> gym.Env | None:
     with D4RLFile(path) as file:
         attributes, arrays = file.attributes(), file.select(("observations", "actions"))
         widths = [int(np.prod(array.shape[1:])) for array in arrays.values()]
-    env_id = attributes.get("env_id") if attributes.get("generated") else None
+    if not attributes.get("generated"):
+        return None
+    asked = attributes.get("environment")
+    by_dataset = known_dataset(asked) if isinstance(asked, str) and not is_path(asked) else None
+    env_id = attributes.get("env_id") if by_dataset is None else by_dataset.id
     if not isinstance(env_id, str) or ":" in env_id:  # module:EnvId would import, and so run, what the file names
         return None
-    if any(spec.env_id == env_id and spec.family != "gym" for spec in catalog.all_specs()):
+    if by_dataset is None and any(spec.env_id == env_id and spec.family != "gym" for spec in catalog.all_specs()):
         return None  # by its id it pays other rewards than those of the datasets, which are corrected
     try:
         env = make_env(env_id)
     except ConfigError:
         return None
+    limit, (below, own_limit) = attributes.get("max_episode_steps"), without_bookkeeping(env)
+    if isinstance(limit, int | np.integer) and limit > 0 and limit != own_limit:
+        env = TimeLimit(below, int(limit))
     both = (env.observation_space, env.action_space)
     fits = all(isinstance(space, spaces.Box) for space in both) and [int(np.prod(s.shape or ())) for s in both] == widths
     return env if fits else None

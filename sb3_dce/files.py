@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from os import PathLike
 from typing import BinaryIO
 
-from sb3_dce.errors import CheckpointError
+from sb3_dce.errors import CheckpointError, DatasetError
 
 
 @contextmanager
@@ -45,6 +45,23 @@ def write_atomically(target: pathlib.Path) -> Iterator[BinaryIO]:
     finally:
         if temporary is not None and os.path.exists(temporary):
             os.unlink(temporary)
+
+
+def exists(path: str | PathLike[str]) -> bool:
+    """
+    :param path: any
+    :return: whether there is something
+    :raises DatasetError: if a folder on the way may not be entered, so that nobody can tell
+    """
+    try:
+        os.stat(path)
+    except PermissionError as error:
+        what = "cannot be reached: a folder on the way may not be entered"
+        hint = "Change the mode of that folder, or copy the file to another"
+        raise DatasetError(what, where=str(path), hint=hint, path=pathlib.Path(path)) from error
+    except (OSError, ValueError):
+        return False
+    return True
 
 
 def write_text(target: pathlib.Path, text: str) -> None:

@@ -14,10 +14,14 @@ from contextlib import contextmanager
 from types import FrameType
 
 
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, which is handled as Ctrl-C is."""
+
+
 def _interrupt(number: int, frame: FrameType | None) -> None:
     """Handler of SIGTERM: often sent more than once, only the first counts."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    raise KeyboardInterrupt
+    raise Terminated
 
 
 # What raises KeyboardInterrupt where nobody else handles the signal.
@@ -52,7 +56,7 @@ class UninterruptedBlock:
         for number, handler in self._replaced.items():
             signal.signal(number, signal.SIG_IGN if number == self._asked == signal.SIGTERM else handler)
         if self._asked is not None and kind is None:
-            raise KeyboardInterrupt
+            raise Terminated if self._asked == signal.SIGTERM else KeyboardInterrupt
 
 
 @contextmanager

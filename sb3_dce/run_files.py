@@ -7,6 +7,7 @@ The files in the folder of a run: what it is, its result, its log.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import platform
@@ -16,7 +17,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -102,7 +103,7 @@ def write_config(
             "sb3_dce": sb3_dce.__version__,
             "commit": source_commit(),
             "python": platform.python_version(),
-            **{name: version(name) for name in ("torch", "stable-baselines3", "gymnasium", "mujoco", "numpy")},
+            **_installed("torch", "stable-baselines3", "gymnasium", "mujoco", "numpy"),
         },
         "machine": {
             "processor": platform.machine(),
@@ -288,3 +289,12 @@ def seconds_before(folder: Path) -> float:
             elapsed = [row.get("time/time_elapsed") for row in csv.DictReader(file)]
         total += max((float(value) for value in elapsed if value), default=0.0)
     return total
+
+
+def _installed(*names: str) -> dict[str, str]:
+    """Versions of those packages that are installed; a simulator need not be."""
+    found = {}
+    for name in names:
+        with contextlib.suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found

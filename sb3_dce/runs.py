@@ -165,7 +165,8 @@ def _train(spec: RunSpec, model: OfflineAlgorithm, folder: Path, report: Report,
         if model.num_timesteps % log_interval:  # what was measured since the last row is in no checkpoint
             model.dump_logs()
         model.save(folder / "checkpoint.zip")
-        raise StoppedError(f"{spec.name} was ended after {model.num_timesteps:,} updates", where=str(folder))
+        what = f"{spec.name} was ended after {model.num_timesteps:,} updates"
+        raise StoppedError(what, where=str(folder), hint="The same call goes on from there.")
     seconds = before + time.monotonic() - started
     model.save(folder / "model.zip")
     write_evaluations(folder, evaluating.evaluations)

@@ -8,20 +8,20 @@ import pathlib
 import pickle
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.save_util import recursive_getattr
+from stable_baselines3.common.save_util import load_from_zip_file, recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 
 from sb3_dce import hyperparams
 from sb3_dce.checks import check_seed
 from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError, SB3DCEError
 from sb3_dce.files import write_atomically
-from sb3_dce.sb3_checks import check_device
+from sb3_dce.sb3_checks import check_device, check_logging
 
 DAMAGED = "The file is damaged or something else: give a zip file written by model.save()."
 
@@ -116,6 +116,7 @@ class SavingMixin(OffPolicyAlgorithm):
         hyperparams.check_keys(cls, kwargs, where=f"{cls.__name__}.load", zoo_keys=False)
         check_seed(kwargs.get("seed"))
         check_device(device)
+        check_logging(kwargs.get("verbose", 0), kwargs.get("stats_window_size", 1), kwargs.get("tensorboard_log"))
         source, dataset = cls._own_file(path), kwargs.pop("dataset", None)
         saved = _saved_data(source)
         _refuse_damage(source)
@@ -141,7 +142,7 @@ class SavingMixin(OffPolicyAlgorithm):
         if kwargs.get("seed") not in (None, saved.get("seed")):  # the saved state of the generator would go on regardless
             model.set_random_seed(kwargs["seed"])
         if any(name in kwargs and kwargs[name] != saved.get(name) for name in CHOOSES_ROWS):
-            model.dataset_statistics = None  # other rows are what was asked for
+            model.forget_rows()  # type: ignore[attr-defined]  # other ones are what was asked for
         if dataset is not None:
             model.set_dataset(dataset)  # type: ignore[attr-defined]  # AttachingMixin has it
         return model
@@ -169,11 +170,17 @@ class SavingMixin(OffPolicyAlgorithm):
         :param load_path_or_dict: zip file, or dictionary as from ``get_parameters()``
         :param exact_match: demand all parameters
         :param device: device
-        :raises CheckpointError: if the parameters belong to another agent or configuration
+        :raises CheckpointError: if the parameters belong to another agent or configuration, or the file is damaged
         """
         if not isinstance(load_path_or_dict, dict):
-            self._own_file(load_path_or_dict)
-        elif exact_match:
+            source = self._own_file(load_path_or_dict)
+            _refuse_damage(source)
+            load_path_or_dict = load_from_zip_file(source, device=device, load_data=False)[1]
+            for name, tensor in _tensors(load_path_or_dict):
+                if not bool(th.isfinite(tensor).all()):
+                    what = f"{_name_of(source)} cannot be used: {name} is not finite"
+                    raise CheckpointError(what, key=name, hint="Go back to an earlier checkpoint.")
+        if exact_match:
             expected, got = set(self._get_torch_save_params()[0]), set(load_path_or_dict)
             if expected != got:
                 # Not a ValueError: SB3's load() would take one for an old DQN file and end in a bare KeyError.
@@ -281,6 +288,14 @@ def _refuse_not_finite(model: Any, error: type[SB3DCEError], what: str) -> None:
 
 def _name_of(source: Path | io.BufferedIOBase) -> str:
     return str(getattr(source, "name", "stream")) if isinstance(source, io.IOBase) else str(source)
+
+
+def _tensors(tree: Any, name: str = "") -> Iterator[tuple[str, th.Tensor]]:
+    if isinstance(tree, th.Tensor):
+        yield name, tree
+    items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
+    for key, value in items:
+        yield from _tensors(value, f"{name}.{key}" if name else str(key))
 
 
 def _cloned(tree: Any) -> Any:

@@ -13,6 +13,7 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EventCallback
 from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_dce.checks import check_choice, check_number, check_widths
 from sb3_dce.errors import ConfigError
@@ -72,13 +73,31 @@ def named_env(env: GymEnv | str, verbose: int) -> GymEnv:
     :param env: environment, or id of one
     :param verbose: 1 lets Stable-Baselines3 say what it makes
     :return: the environment
-    :raises ConfigError: for an unknown id
+    :raises ConfigError: for an id that is unknown, or whose environment cannot be made here
     """
     try:
         return maybe_make_env(env, verbose)
-    except gym.error.Error as error:
+    except (gym.error.Error, ImportError, TypeError, ValueError) as error:
         hint = "Give an id that gymnasium.make knows, an environment, or leave it out."
         raise ConfigError(f"no environment {env!r}: {error}", key="env", hint=hint) from error
+
+
+def check_one_env(env: VecEnv) -> None:
+    """
+    :param env: environments
+    :raises ConfigError: if there is more than one
+    """
+    if env.num_envs != 1:
+        hint = "Give one; evaluate_policy(model, vec_env) and EvalCallback(vec_env) take several."
+        raise ConfigError(f"the model wants one environment, got {env.num_envs} in one", key="env", hint=hint)
+
+
+def python_number(value: Any) -> Any:
+    """
+    :param value: number, perhaps one of NumPy's, which Stable-Baselines3 does not take, or a schedule
+    :return: the same, as a number of Python
+    """
+    return float(value) if isinstance(value, np.number) else value
 
 
 def policy_arguments(given: Any, policy_class: type, settings: dict[str, Any]) -> dict[str, Any]:
@@ -114,8 +133,8 @@ def policy_arguments(given: Any, policy_class: type, settings: dict[str, Any]) -
             raise ConfigError(f"{name}={value!r} in policy_kwargs would contradict the agent", key=name, hint=hint)
         if name == "net_arch":
             _check_net_arch(value)
-        if name == "activation_fn" and not callable(value):
-            hint = "For example torch.nn.Tanh."
+        if name == "activation_fn" and not _makes_module(value):
+            hint = "For example torch.nn.Tanh, the class itself."
             raise ConfigError(f"activation_fn must be a class of torch.nn, got {value!r}", key="activation_fn", hint=hint)
         if name == "n_critics":
             check_number("n_critics", value, 1, integer=True)
@@ -204,3 +223,11 @@ def callback_frequencies(callback: BaseCallback) -> list[tuple[str, int]]:
     for child in children:
         found += [] if child is None else callback_frequencies(child)
     return found
+
+
+def _makes_module(value: Any) -> bool:
+    """Whether the networks can make layers of it: a class, or a function without arguments."""
+    try:
+        return isinstance(value(), th.nn.Module)
+    except Exception:
+        return False

@@ -141,7 +141,7 @@ def evaluate_file(model_path: Path, dataset: str | None, n_episodes: int, seed: 
     rollouts = rollouts_of(dataset or model.dataset, n_episodes)
     if rollouts is None:
         raise ConfigError(
-            f"no environment is known for {model.dataset!r}, on which the model was trained",
+            f"no environment is known for {model.dataset or 'data in memory'}, on which the model was trained",
             key="dataset",
             hint="Give its id with --env, or use evaluate_policy(model, env) of Stable-Baselines3. Where a known dataset has "
             "the same environment, --dataset adds the score.",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+import torch as th
 from agents_under_test import AGENTS, accepts, make
 
 from sb3_dce import Transitions
@@ -120,6 +121,8 @@ def test_wrong_argument_is_refused_by_the_constructor(key: str, name: str, value
         ({"net_arch": [-3]}, "net_arch must be a list"),
         ({"net_arch": {"pi": [8.0], "qf": [8]}}, r"net_arch\['pi'\] must be a list"),
         ({"activation_fn": "tanh"}, "activation_fn must be a class"),
+        ({"activation_fn": th.nn.ReLU()}, "activation_fn must be a class"),
+        ({"activation_fn": th.nn.functional.relu}, "activation_fn must be a class"),
         ({"n_critics": 0}, "n_critics must be an integer"),
     ],
 )

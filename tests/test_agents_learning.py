@@ -70,6 +70,28 @@ def test_evaluation_at_n_sees_exactly_n_updates(
     assert same(recorder.kept[0], weights(make(agent, dataset=transitions).learn(5)))
 
 
+def test_callbacks_see_what_they_count_after_a_length_that_is_no_multiple(transitions: Transitions) -> None:
+    model, recorder = make(AGENTS["DCE"], dataset=transitions, gradient_steps=5), Recorder()
+    model.learn(7, log_interval=None)
+    model.learn(13, recorder, reset_num_timesteps=False, log_interval=None)
+    counted = dict(recorder.seen)
+    assert (counted[10], counted[15], counted[20]) == (10, 15, 20)
+
+
+def test_model_goes_on_after_a_callback_that_fails_in_the_middle(transitions: Transitions) -> None:
+    model = make(AGENTS["DCE"], dataset=transitions, gradient_steps=5)
+
+    class Failing(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 8:
+                raise RuntimeError("of the callback")
+            return True
+
+    with pytest.raises(RuntimeError, match="of the callback"):
+        model.learn(20, Failing(), log_interval=None)
+    assert model.num_timesteps == model._n_updates == 10
+
+
 def test_training_mode_is_restored_after_an_evaluation(
     agent: Agent, transitions: Transitions, make_point_mass: Callable[[], gym.Env], monkeypatch: pytest.MonkeyPatch
 ) -> None:

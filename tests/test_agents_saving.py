@@ -248,3 +248,51 @@ def test_new_count_of_timesteps_goes_on_with_the_updates(agent: Agent, transitio
     model = make(agent, dataset=transitions).learn(4)
     model.learn(3)
     assert (model.num_timesteps, model._n_updates) == (3, 7)
+
+
+@pytest.mark.parametrize("saved", ["auto", 0.2])
+def test_parameters_of_a_file_are_all_taken_or_none(saved: float | str, transitions: Transitions, tmp_path: Path) -> None:
+    other = 0.2 if saved == "auto" else "auto"
+    settings = {"policy_kwargs": {"net_arch": [8]}, "dataset": transitions, "device": "cpu"}
+    source = OfflineDCE("MlpPolicy", ent_coef=saved, seed=1, **settings)
+    source.save(tmp_path / "model.zip")
+    model = OfflineDCE("MlpPolicy", ent_coef=other, seed=2, **settings)
+    before = weights(model)
+    with pytest.raises(CheckpointError, match="parameters do not match this configuration"):
+        model.set_parameters(tmp_path / "model.zip")
+    assert same(before, weights(model))
+    twin = OfflineDCE("MlpPolicy", ent_coef=saved, seed=2, **settings)
+    twin.set_parameters(tmp_path / "model.zip")
+    assert same(weights(twin), weights(source))
+
+
+def test_parameters_of_a_damaged_file_are_refused(transitions: Transitions, tmp_path: Path) -> None:
+    model = OfflineDCE("MlpPolicy", dataset=transitions, policy_kwargs={"net_arch": [8]}, device="cpu")
+    model.save(tmp_path / "model.zip")
+    with zipfile.ZipFile(tmp_path / "model.zip") as whole, zipfile.ZipFile(tmp_path / "nan.zip", "w") as changed:
+        parameters = th.load(io.BytesIO(whole.read("policy.pth")), weights_only=True)
+        next(iter(parameters.values()))[...] = float("nan")
+        stream = io.BytesIO()
+        th.save(parameters, stream)
+        for name in whole.namelist():
+            changed.writestr(name, stream.getvalue() if name == "policy.pth" else whole.read(name))
+    content = bytearray((tmp_path / "model.zip").read_bytes())
+    content[content.index(b"policy.pth") + 400] ^= 255
+    (tmp_path / "flipped.zip").write_bytes(content)
+    before = weights(model)
+    for name, message in (("nan", r"policy\..* is not finite"), ("flipped", "is damaged")):
+        with pytest.raises(CheckpointError, match=message):
+            model.set_parameters(tmp_path / f"{name}.zip")
+    assert same(before, weights(model))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"verbose": "yes"}, "verbose must be one of"), ({"tensorboard_log": 5}, "tensorboard_log must be a folder")],
+)
+def test_values_given_to_load_are_checked(change: dict, message: str, transitions: Transitions, tmp_path: Path) -> None:
+    OfflineDCE("MlpPolicy", dataset=transitions, device="cpu").save(tmp_path / "model.zip")
+    with pytest.raises(ConfigError, match=message):
+        OfflineDCE.load(tmp_path / "model.zip", **change)
+    loaded = OfflineDCE.load(tmp_path / "model.zip", learning_rate=np.float32(1e-4), device="cpu")
+    assert loaded.learning_rate == pytest.approx(1e-4)

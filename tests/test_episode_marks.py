@@ -20,7 +20,7 @@ from sb3_dce import OfflineBC, OfflineDCE, load_dataset
 from sb3_dce.data.examination import examine
 from sb3_dce.data.selection import rows_of_best_episodes
 from sb3_dce.envs import SpacesEnv
-from sb3_dce.errors import DatasetError, DatasetFormatError, DatasetSemanticsError, DatasetWarning, SB3DCEError
+from sb3_dce.errors import ConfigError, DatasetError, DatasetFormatError, DatasetSemanticsError, DatasetWarning, SB3DCEError
 
 IDS = np.repeat(["B-12", "A-3", "B-1"], [5, 4, 6])
 
@@ -176,6 +176,30 @@ def test_a_list_of_episodes_is_a_dataset(kind: str) -> None:
     assert np.array_equal(data.next_observations[4], np.float32(episodes[0]["observations"][5]))
 
 
+@pytest.mark.parametrize(
+    "marks",
+    [
+        {"terminated": [0, 0, 1]},
+        {"terminal": [0, 0, 1], "truncated": [0, 0, 0]},
+        {"terminated": True},  # of the whole episode, as d3rlpy keeps it
+        {"terminals": [0, 0, 1], "dones": [0, 0, 1]},
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("kind", [dict, SimpleNamespace])
+def test_true_ends_of_a_list_of_episodes_go_by_many_names(marks: dict[str, Any], kind: type) -> None:
+    plain = {key: value for key, value in episode(3).items() if key != "terminations"}
+    data = load_dataset([kind(**plain, **marks), kind(**plain, **marks)])
+    assert data.terminals.tolist() == [0, 0, 1, 0, 0, 1] and data.info.n_timeouts == 0
+
+
+@pytest.mark.parametrize("name", ["done", "dones"])
+def test_ends_that_may_be_either_are_asked_about(name: str) -> None:
+    plain = {key: value for key, value in episode(3).items() if key != "terminations"}
+    with pytest.raises(ConfigError, match=f"episode 0 has '{name}' and no terminals. Does '{name}' mix terminals"):
+        load_dataset([{**plain, name: [0, 0, 1]}])
+
+
 def test_episodes_without_the_last_observation_lose_their_last_step() -> None:
     episodes = [episode(5), episode(3, terminated=True)]
     for e in episodes:
@@ -193,6 +217,7 @@ def test_episodes_without_the_last_observation_lose_their_last_step() -> None:
         ([{**episode(3), "observations": {"a": np.ones(4)}}], "episode 0 are in parts"),
         ([episode(3), {**episode(3), "observations": np.ones((4, 3))}], "observations of episode 1 have width 3, those of"),
         ([{**episode(3), "actions": 1.0}], r"actions of episode 0 have shape \(\)"),
+        ([{**episode(3), "actions": [[1.0], [2.0, 3.0], [4.0]]}], r"episode 0: actions is no array .*one row per step"),
         ([{**episode(3), "terminations": np.full(3, np.nan)}], "episode 0, key terminals: flags must be 0/1"),
     ],
 )

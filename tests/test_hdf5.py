@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import pickle
 import stat
+import subprocess
+import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -254,3 +258,30 @@ def test_content_hash_depends_on_core_numbers_only(tmp_path: Path) -> None:
     assert content_hash(dict(reversed(big_endian.items()))) == expected
     assert content_hash(arrays | {"rewards": arrays["rewards"] + 1}) != expected
     assert content_hash(arrays | {"rewards": arrays["rewards"].astype("f8")}) != expected
+
+
+def test_file_behind_a_closed_folder_is_said_to_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Root may enter every folder, so the answer of the system is made up."""
+    closed, stat_of = tmp_path / "closed", os.stat
+
+    def refuse(path: Any, *args: Any, **kwargs: Any) -> os.stat_result:
+        if isinstance(path, str | os.PathLike) and str(path).startswith(str(closed)):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return stat_of(path, *args, **kwargs)
+
+    monkeypatch.setattr(os, "stat", refuse)
+    for name in ("data.hdf5", "data.csv", "data.npz"):
+        with pytest.raises(DatasetError, match=r"a folder on the way may not be entered\. Change the mode"):
+            load_transitions(closed / name)
+
+
+def test_file_that_is_being_written_is_not_called_damaged(tmp_path: Path) -> None:
+    path = write_plain(tmp_path / "data.hdf5", base_arrays())
+    code = "import h5py, sys, time; f = h5py.File(sys.argv[1], 'a', locking=True); print('open', flush=True); time.sleep(60)"
+    with subprocess.Popen([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True) as writer:
+        assert writer.stdout is not None and writer.stdout.readline() == "open\n"
+        try:
+            with pytest.raises(DatasetIntegrityError, match=r"another program has opened the file for writing\. Wait"):
+                load_transitions(path)
+        finally:
+            writer.kill()

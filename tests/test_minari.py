@@ -22,7 +22,7 @@ from sb3_dce import OfflineDCE, cli
 from sb3_dce.data import Transitions, find_file, load_transitions, normalized_score
 from sb3_dce.data.locate import catalogue_id
 from sb3_dce.data.minari_download import download_minari
-from sb3_dce.envs import SpacesEnv, make_minari_env
+from sb3_dce.envs import SpacesEnv, make_minari_env, own_env
 from sb3_dce.errors import (
     ConfigError,
     DatasetError,
@@ -471,6 +471,13 @@ def test_environment_for_evaluation_is_gymnasiums_own_entry(root: Path) -> None:
     dataset(root, episode(3), env_spec=json.dumps({"id": "CartPole-v1"}), eval_env_spec=json.dumps(spec))
     env = make_minari_env("minari:own/set-v0")
     assert env is not None and env.spec is not None and env.spec.id == "Pendulum-v1" and env.spec.max_episode_steps == 200
+
+
+@pytest.mark.parametrize("way", ["", "data/main_data.hdf5"])
+def test_environment_is_found_by_a_path_and_of_data_that_were_read(root: Path, way: str) -> None:
+    path = dataset(root, episode(3), env_spec=json.dumps({"id": "Pendulum-v1", "kwargs": {}})) / way
+    for env in (own_env(str(path)), own_env(str(load_transitions("minari:own/set-v0").info.path))):
+        assert env is not None and env.spec is not None and env.spec.id == "Pendulum-v1"
 
 
 def test_adroit_environment_is_found_if_its_package_is_installed(root: Path) -> None:

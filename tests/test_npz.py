@@ -229,9 +229,14 @@ def test_a_rewritten_file_does_not_pass_for_an_official_one(tmp_path: Path) -> N
         "next_observations": np.ones((200, 11)),
         "actions": np.zeros((200, 3)),
     }
-    Transitions.from_arrays(**arrays).to_hdf5(tmp_path / "hopper-medium-v2.hdf5")
-    with pytest.raises(DatasetSemanticsError, match="generated = true"):
-        load_transitions(tmp_path / "hopper-medium-v2.hdf5")
+    data = Transitions.from_arrays(**arrays)
+    data.to_hdf5(tmp_path / "hopper-medium-v2.hdf5")
+    data.to_npz(tmp_path / "hopper-medium-v2.npz")
+    for suffix in ("hdf5", "npz"):
+        with pytest.raises(DatasetSemanticsError, match="generated = true"):
+            load_transitions(tmp_path / f"hopper-medium-v2.{suffix}")
+    data.to_npz(tmp_path / "mine.npz")
+    assert load_transitions(tmp_path / "mine.npz").info.id == "mine"
 
 
 def test_failed_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -31,7 +31,7 @@ import sb3_dce as package
 from sb3_dce import OfflineBC, OfflineDCE, OfflineSACV, OfflineTD3BC, OfflineUWAC, Transitions, agents
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.data import load_transitions
-from sb3_dce.envs import SpacesEnv
+from sb3_dce.envs import SpacesEnv, own_env, without_bookkeeping
 from sb3_dce.errors import ConfigError, DatasetError, DatasetIntegrityError, DatasetWarning, SB3DCEWarning
 from sb3_dce.evaluation import EvaluationCallback, evaluate
 from sb3_dce.population import Population
@@ -290,6 +290,19 @@ def test_recorded_files_say_where_they_are_evaluated(tmp_path: Path) -> None:
     assert env is not None and env.observation_space == gym.make("Pendulum-v1").observation_space
     rollouts = rollouts_of(str(tmp_path / "p.hdf5"), 1)
     assert rollouts is not None and len(evaluate(model, rollouts, seed=0).returns) == 1
+
+
+def test_recorded_files_are_evaluated_as_they_were_recorded(tmp_path: Path) -> None:
+    pytest.importorskip("gymnasium_robotics")
+    for env, limit, asked in (("Pendulum-v1", 30, True), ("Pendulum-v1", 300, True), ("pen-human-v0", 100, False)):
+        what = ["--policy", "random", "--env", env, "--episodes", "1", "--name", "own-sb3", "--workers", "1", "--force"]
+        what += ["--max-episode-steps", str(limit)] if asked else []
+        made = sb3_dce("datasets", "record", *what, "--out", str(tmp_path / "own.hdf5"))
+        assert made.code == 0, made.stderr
+        found = own_env(str(tmp_path / "own.hdf5"))
+        assert found is not None and without_bookkeeping(found)[1] == limit
+        if env.startswith("pen"):  # the environment of the datasets, whose rewards are corrected
+            assert type(found.unwrapped) is type(gym.make(env).unwrapped)
 
 
 def test_a_name_in_a_file_imports_nothing(tmp_path: Path, transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:

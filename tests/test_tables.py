@@ -338,3 +338,28 @@ def test_one_front_door_for_all_suffixes(tmp_path: Path, frame: pd.DataFrame) ->
         got = load_transitions(str(tmp_path / name), **options)
         assert np.array_equal(got.rows, expected.rows) and np.array_equal(got.timeouts, expected.timeouts), name
         assert got.info.id == "mine" and got.info.path == tmp_path / name
+
+
+@pytest.mark.parametrize("columns", [["a", "b"], "reward", 5])
+def test_columns_must_map_keys_to_names(columns: Any, tmp_path: Path) -> None:
+    frame = pd.DataFrame({"a": [1.0, 2.0], "b": [1.0, 2.0]})
+    frame.to_csv(tmp_path / "log.csv", index=False)
+    for read in (lambda: arrays_from_csv(tmp_path / "log.csv", columns), lambda: arrays_from_dataframe(frame, columns)):
+        with pytest.raises(ConfigError, match="columns must map keys to column names, got"):
+            read()
+
+
+@pytest.mark.parametrize("sep", [None, 5, "", ";;"])
+def test_separator_is_one_character(sep: Any, tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("obs_0\n1\n")
+    with pytest.raises(ConfigError, match="must be one character"):
+        arrays_from_csv(tmp_path / "log.csv", sep=sep)
+
+
+def test_table_that_does_not_fit_into_memory_is_refused_before_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "log.csv").write_text("obs_0,action_0,reward,terminal\n" + "1,0,1,0\n" * 100)
+    monkeypatch.setattr("sb3_dce.data.memory.free_memory", lambda: 3000)
+    with pytest.raises(DatasetSecurityError, match="100 rows need 3,200 bytes of memory, 3,000 are free"):
+        arrays_from_csv(tmp_path / "log.csv")

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from sb3_dce.data import Transitions, content_hash, file_sha256, resolve
 from sb3_dce.data.layout import BLOCK_ROWS
-from sb3_dce.errors import DatasetWarning
+from sb3_dce.errors import DatasetFormatError, DatasetSemanticsError, DatasetWarning
 
 pytestmark = pytest.mark.filterwarnings("ignore::sb3_dce.errors.DatasetWarning")
 
@@ -411,3 +411,37 @@ def test_jumps_are_found_by_the_distance_of_two_observations() -> None:
     transitions = Transitions.from_arrays(observations, rewards, rewards, terminals, terminals, following)
     assert np.flatnonzero(np.diff(transitions.episodes)).tolist() == [9, 29]
     assert "2 unmarked jumps of the observation (2.02% of rows): an episode ends there" in transitions.info.notes
+
+
+@pytest.mark.parametrize("scale", [np.float32(2.0), np.int64(2), 2])
+def test_bounds_may_be_numbers_of_numpy(scale: Any) -> None:
+    made = Transitions.from_arrays(**base_arrays(), action_scale=scale)
+    assert set(made.info.action_space_high.tolist()) == {2.0}
+
+
+def test_rows_that_all_have_a_hole_are_said_to() -> None:
+    arrays = base_arrays()
+    arrays["observations"][:, 1] = np.nan
+    arrays["next_observations"] = np.zeros_like(arrays["observations"])
+    with pytest.raises(DatasetSemanticsError, match="every usable row has a NaN or infinite value") as caught:
+        Transitions.from_arrays(**arrays, drop_nonfinite=True)
+    assert caught.value.check == "finite values" and "Leave out the column" in str(caught.value)
+
+
+def test_name_of_a_file_claims_nothing_by_half(tmp_path: Path) -> None:
+    arrays = base_arrays()
+    for key, array in arrays.items():
+        arrays[key] = np.concatenate([array, array])
+    write_plain(tmp_path / "robot-cloned-run.hdf5", arrays)
+    write_plain(tmp_path / "hopper-medium.hdf5", base_arrays())
+    with pytest.warns(DatasetWarning, match="are duplicates of another row"):
+        Transitions.from_hdf5(tmp_path / "robot-cloned-run.hdf5")
+    assert "score" not in " ".join(Transitions.from_hdf5(tmp_path / "hopper-medium.hdf5").summary())
+
+
+@pytest.mark.parametrize(
+    "observations", [[[1.0], [1.0, 2.0]], th.ones(200, 3, requires_grad=True)], ids=["ragged", "with gradient"]
+)
+def test_what_is_no_array_is_refused_in_words(observations: Any) -> None:
+    with pytest.raises(DatasetFormatError, match=r"observations is no array \(.*detach"):
+        Transitions.from_arrays(**{**base_arrays(), "observations": observations})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import warnings
 from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,11 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.sac.policies import SACPolicy
 
-from sb3_dce import OfflineBC, OfflineDCE, OfflineSAC, Transitions, load_dataset
+from sb3_dce import OfflineBC, OfflineDCE, OfflineIQL, OfflineSAC, OfflineTD3BC, Transitions, load_dataset, run_files
 from sb3_dce.envs import SpacesEnv
-from sb3_dce.errors import ConfigError, DatasetIntegrityError, DatasetWarning
+from sb3_dce.errors import ConfigError, DatasetIntegrityError, DatasetNotFoundError, DatasetWarning
 from sb3_dce.evaluation import EvaluationCallback
+from sb3_dce.networks import StandardizedExtractor
 from sb3_dce.rollouts import Rollouts
 
 SMALL: dict[str, Any] = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "execution": "eager"}
@@ -57,6 +59,105 @@ def table(tmp_path: Path) -> Path:
 @pytest.fixture
 def sac(make_point_mass: Callable[[], gym.Env]) -> SAC:
     return SAC("MlpPolicy", make_point_mass(), learning_starts=1000, policy_kwargs={"net_arch": [8]}, seed=0).learn(60)
+
+
+# -- data that were read before ------------------------------------------------------------------------------------------
+
+
+def test_data_that_were_read_before_bring_row_and_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = load_dataset(arrays_of_hopper())
+    data.to_hdf5(tmp_path / "hopper-medium-expert-sb3.hdf5")
+    monkeypatch.setenv("SB3_DCE_DATASETS", str(tmp_path))
+    by_name = OfflineDCE.load_dataset("hopper-medium-expert-sb3", device="cpu")
+    by_data = OfflineDCE.load_dataset(load_dataset("hopper-medium-expert-sb3"), device="cpu")
+    default = OfflineDCE.load_dataset(data, device="cpu")
+    rows = [{**model.hyperparameters(), "dataset": None} for model in (by_name, by_data, default)]
+    assert rows[0] == rows[1] != rows[2]
+    environments = [type(model.get_env().envs[0].unwrapped) for model in (by_name, by_data, default)]
+    assert environments[0] is environments[1] is not environments[2]
+    # with other bounds of the actions it is another task
+    wide = load_dataset("hopper-medium-expert-sb3", action_scale=2.0)
+    assert {**OfflineDCE.load_dataset(wide, device="cpu").hyperparameters(), "dataset": None} == rows[2]
+
+
+def arrays_of_hopper() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return {
+        **arrays(),
+        "observations": rng.standard_normal((60, 11)),
+        "actions": rng.uniform(-1, 1, (60, 3)),
+        "next_observations": rng.standard_normal((60, 11)),
+    }
+
+
+@pytest.mark.parametrize("cls", [OfflineTD3BC, OfflineIQL])
+def test_trained_model_keeps_what_it_was_trained_with_on_other_data(cls: Any, tmp_path: Path) -> None:
+    first, second = arrays(), arrays()
+    second["observations"] = 5.0 + 3.0 * second["observations"]
+    second["rewards"] = 10.0 * second["rewards"]
+    more = {"reward_normalization": "iql"} if cls is OfflineIQL else {}
+    model = cls.load_dataset(load_dataset(first), seed=0, **SMALL, **more).learn(2)
+
+    def kept() -> tuple[list[float], float]:
+        extractor = next(m for m in model.policy.modules() if isinstance(m, StandardizedExtractor))
+        return extractor.mean.tolist(), model._reward_factor()
+
+    before = kept() if cls is OfflineTD3BC else ([], model._reward_factor())
+    model.set_dataset(load_dataset(second))
+    model.save(tmp_path / "model.zip")
+    for changed in (model, cls.load(tmp_path / "model.zip", dataset=load_dataset(second))):
+        model = changed.learn(2, reset_num_timesteps=False)
+        assert model.replay_buffer.rewards.max() > 9.0
+        assert (kept() if cls is OfflineTD3BC else ([], model._reward_factor())) == before
+    fresh = cls.load_dataset(load_dataset(first), seed=0, **SMALL, **more)
+    fresh.set_dataset(load_dataset(second))
+    model = fresh.learn(1)
+    assert (kept() if cls is OfflineTD3BC else ([], model._reward_factor())) != before, "it has learned nothing yet"
+
+
+def test_buffer_with_other_rows_is_noticed(tmp_path: Path) -> None:
+    other, same = arrays(), load_dataset(arrays())
+    other["rewards"] = other["rewards"] - 7.0
+    OfflineDCE.load_dataset(load_dataset(other), seed=0, **SMALL).learn(1).save_replay_buffer(tmp_path / "other.pkl")
+    same.to_hdf5(tmp_path / "data.hdf5")
+    model = OfflineDCE.load_dataset(tmp_path / "data.hdf5", seed=0, **SMALL).learn(2)
+    model.save_replay_buffer(tmp_path / "same.pkl")
+    model.save(tmp_path / "model.zip")
+    loaded = OfflineDCE.load(tmp_path / "model.zip")
+    loaded.load_replay_buffer(tmp_path / "same.pkl")
+    loaded.learn(1, reset_num_timesteps=False)  # the rows it knows: no word
+    loaded = OfflineDCE.load(tmp_path / "model.zip")
+    loaded.load_replay_buffer(tmp_path / "other.pkl")
+    with pytest.warns(DatasetWarning, match=r"57 rows of the replay buffer; .*data\.hdf5 is not read"):
+        loaded.learn(1, reset_num_timesteps=False)
+    assert loaded.dataset_statistics["reward_mean"] < -6.0
+    loaded.save(tmp_path / "later.zip")
+    with pytest.raises(DatasetIntegrityError, match="not the rows the model was trained on"):
+        OfflineDCE.load(tmp_path / "later.zip").learn(1)
+    # a model that has not read its dataset yet, with a buffer of the same rows, goes on with either
+    fresh = OfflineDCE.load_dataset(tmp_path / "data.hdf5", seed=0, **SMALL)
+    fresh.load_replay_buffer(tmp_path / "same.pkl")
+    with pytest.warns(DatasetWarning, match="of the replay buffer"):
+        fresh.learn(1)
+    fresh.save(tmp_path / "fresh.zip")
+    OfflineDCE.load(tmp_path / "fresh.zip").learn(1)
+
+
+def test_buffer_of_data_in_memory_is_saved_before_the_first_update(tmp_path: Path) -> None:
+    model = OfflineDCE.load_dataset(load_dataset(arrays()), **SMALL)
+    model.save_replay_buffer(tmp_path / "buffer.pkl")
+    other = OfflineDCE("MlpPolicy", model.get_env(), **SMALL)
+    other.load_replay_buffer(tmp_path / "buffer.pkl")
+    assert other.learn(1).replay_buffer.size() == 57
+
+
+def test_data_that_have_moved_are_said_to_have(tmp_path: Path) -> None:
+    load_dataset(arrays()).to_hdf5(tmp_path / "data.hdf5")
+    OfflineDCE.load_dataset(tmp_path / "data.hdf5", **SMALL).learn(1).save(tmp_path / "model.zip")
+    (tmp_path / "data.hdf5").rename(tmp_path / "moved.hdf5")
+    with pytest.raises(DatasetNotFoundError, match=r"no such file.*set_dataset\(<new path>\)"):
+        OfflineDCE.load(tmp_path / "model.zip").learn(1)
+    OfflineDCE.load(tmp_path / "model.zip", dataset=tmp_path / "moved.hdf5").learn(1)
 
 
 # -- going on ----------------------------------------------------------------------------------------------------------
@@ -167,6 +268,8 @@ def test_saved_buffer_of_another_algorithm_can_be_loaded(sac: SAC, spaces_env: S
     model.replay_buffer = sac.replay_buffer
     with pytest.raises(ConfigError, match=r"is a ReplayBuffer, .*set_dataset"):
         model.learn(2)
+    model.set_dataset(load_dataset(sac.replay_buffer))
+    assert model.learn(2).replay_buffer.size() == 60, "the remedy works"
 
 
 def test_buffer_saved_by_an_earlier_version(tmp_path: Path) -> None:
@@ -291,3 +394,36 @@ def test_an_evaluation_at_the_interval_of_the_log_makes_one_row(
     rows = rows_of(tmp_path / "own")
     assert rows["time/total_timesteps"].tolist() == [5, 10]
     assert rows[["train/q_data", "eval/mean_reward", "time/fps"]].notna().all(axis=None)
+
+
+# -- environments by their ids -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["HalfCheetah-v2", "no_such_module:Env-v0", "Nowhere-v0"])
+def test_environment_that_cannot_be_made_is_said(name: str, spaces_env: SpacesEnv) -> None:
+    with pytest.raises(ConfigError, match=f"no environment '{name}'.*Give an id that gymnasium.make knows"):
+        OfflineDCE("MlpPolicy", name, dataset=TINY, **SMALL)
+    with pytest.raises(ConfigError, match=f"no environment '{name}'"):
+        OfflineDCE("MlpPolicy", spaces_env, **SMALL).set_env(name)
+
+
+def test_environment_may_be_set_by_its_id(tmp_path: Path) -> None:
+    model = OfflineDCE.load_dataset(TINY, **SMALL)
+    model.set_env("HalfCheetah-v4")
+    model.save(tmp_path / "model.zip")
+    assert OfflineDCE.load(tmp_path / "model.zip", env="HalfCheetah-v4").get_env() is not None
+
+
+def test_several_environments_are_refused(make_point_mass: Callable[[], gym.Env]) -> None:
+    with pytest.raises(ConfigError, match=r"wants one environment, got 2 in one\. Give one"):
+        OfflineDCE("MlpPolicy", DummyVecEnv([make_point_mass] * 2), **SMALL)
+
+
+def test_run_without_the_metadata_of_mujoco_says_its_versions(monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(name: str) -> str:
+        if name == "mujoco":
+            raise PackageNotFoundError(name)
+        return "1.0"
+
+    monkeypatch.setattr(run_files, "version", absent)
+    assert run_files._installed("numpy", "mujoco") == {"numpy": "1.0"}

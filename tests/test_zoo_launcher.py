@@ -67,6 +67,13 @@ REFUSALS = {
     "unknown environment": Refusal(
         ["train", "--algo", "dce", "--env", "walker2d-medum-v2"], "", "Did you mean 'walker2d-medium-v2'?"
     ),
+    "unknown hyperparameter of a file": Refusal(
+        [*TRAIN, *NO_EVALUATION, "-conf", "own_wrong.yml"],
+        "",
+        "own_wrong.yml: OfflineDCE has no parameter 'expectil'.",
+    ),
+    "no row in a file": Refusal([*TRAIN, *NO_EVALUATION, "--conf", "own_other.yml"], "", "no row for halfcheetah-tiny-sb3"),
+    "no such file": Refusal([*TRAIN, *NO_EVALUATION, "--conf-file", "own_none.yml"], "", "own_none.yml: the file cannot be"),
     "unknown hyperparameter": Refusal([*TRAIN, "-params", "expectil:0.8"], "", "Did you mean 'expectile'?"),
     "evaluation without simulator": Refusal(
         TRAIN, "mujoco", 'pip install "gymnasium[mujoco]" - or train without evaluation: --eval-freq -1'
@@ -122,6 +129,8 @@ def refusals(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, s
     pytest.importorskip("rl_zoo3")
     folder = tmp_path_factory.mktemp("refusals")
     nowhere = {name: str(folder) for name in ("HOME", "XDG_CACHE_HOME", "D4RL_DATASET_DIR", "SB3_DCE_DATASETS")}
+    (folder / "own_wrong.yml").write_text(yaml.safe_dump({DATASET: {"policy": "MlpPolicy", "expectil": 0.7}}))
+    (folder / "own_other.yml").write_text(yaml.safe_dump({"hopper-medium-v2": {"policy": "MlpPolicy"}}))
     result = _python(folder, "-c", REFUSE_ALL, json.dumps(REFUSALS), **nowhere)
     assert result.returncode == 0, result.stdout + result.stderr
     assert not (folder / "logs").exists()
@@ -194,6 +203,8 @@ from sb3_dce.agents import AGENTS
 from sb3_dce.zoo import registry
 assert not set(before) & set(AGENTS)
 assert registry.register() is rl_zoo3.ALGOS == {**before, **AGENTS}
+import gymnasium as gym
+assert "PendulumNoVel-v1" in gym.registry, "an environment that its own scripts know"
 from rl_zoo3 import exp_manager
 assert exp_manager.ALGOS is rl_zoo3.ALGOS
 assert {"sac", "dce"} <= set(exp_manager.HYPERPARAMS_SAMPLER) & set(exp_manager.HYPERPARAMS_CONVERTER)

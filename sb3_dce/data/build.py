@@ -133,6 +133,16 @@ def build_rows(
         used &= ~bad
         n_bad = int(bad.sum())
         findings.note("finite values", f"{n_bad} rows with NaN or infinite values were dropped", n_bad)
+        if not used.any():
+            empty = next((s for s in summaries.values() if s.n_bad >= len(rows)), None)
+            of = "" if empty is None else f"; one is {empty.key}, with {empty.n_bad:,} such values"
+            raise DatasetSemanticsError(
+                f"every usable row has a NaN or infinite value{of}",
+                check="finite values",
+                where=where,
+                hint="Leave out the column that has no finite value, or repair the file",
+                count=n_bad,
+            )
         _require_rows(used, where)
     _check_content(rows, layout, summaries, sources, findings)
     actions = check_actions(rows[:, layout.actions], summaries["actions"], options, findings, where)
@@ -140,7 +150,7 @@ def build_rows(
     whole = _whole_episodes(episodes, rewards.returns, bad)
     if INCOMPLETE in sources:
         whole[episodes.index[read_flags(sources[INCOMPLETE], INCOMPLETE, where)]] = False
-    if "-cloned-" not in dataset_id:  # D4RL fills these up with copies of the demonstrations
+    if spec is None or "-cloned-" not in spec.id:  # D4RL fills these up with copies of the demonstrations
         check_duplicates(rows, findings)
 
     file_rows = len(rows)

@@ -135,6 +135,14 @@ def spec_of_file(path: str | PathLike[str]) -> DatasetSpec | None:
     return by_file_name or _SPECS.get(PurePath(name).stem)
 
 
+def is_id(name: str) -> bool:
+    """
+    :param name: any
+    :return: whether it is the id of a dataset as it stands, and no alias
+    """
+    return name in _SPECS
+
+
 def all_specs() -> list[DatasetSpec]:
     """
     All datasets, in the order of the table.

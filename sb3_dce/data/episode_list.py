@@ -7,10 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from sb3_dce.data.layout import read_flags
+from sb3_dce.data.layout import as_array, read_flags
+from sb3_dce.data.tables import AMBIGUOUS_NAMES
 from sb3_dce.errors import ConfigError, DatasetFormatError
 
-_OTHER_NAMES = {"terminals": "terminations", "timeouts": "truncations"}
+# Minari's names, Gymnasium's, and the singular.
+_OTHER_NAMES = {
+    "terminals": ("terminations", "terminated", "terminal"),
+    "timeouts": ("truncations", "truncated", "timeout"),
+}
 _NEEDED = ("observations", "actions", "rewards")
 
 
@@ -21,9 +26,10 @@ def arrays_from_episodes(episodes: Iterable[Any]) -> dict[str, np.ndarray]:
     marked as a true end.
 
     :param episodes: dictionaries, or objects with such attributes: ``observations, actions, rewards``, and where present
-        ``terminals`` (or Minari's ``terminations``), ``timeouts`` (``truncations``) and ``next_observations``
+        ``terminals`` (or ``terminations``, ``terminated``), ``timeouts`` (``truncations``, ``truncated``) and
+        ``next_observations``. A flag may be one value for the whole episode, that of its last step
     :return: key to array
-    :raises ConfigError: if something is no episode
+    :raises ConfigError: if something is no episode, or its ends are marked by ``dones`` alone
     :raises DatasetFormatError: if the arrays of an episode do not fit together, or only some have a next observation
     """
     parts = [_arrays_of(episode, number) for number, episode in enumerate(episodes)]
@@ -46,7 +52,7 @@ def arrays_from_episodes(episodes: Iterable[Any]) -> dict[str, np.ndarray]:
 
 def _arrays_of(episode: Any, number: int) -> dict[str, np.ndarray]:
     def find(name: str) -> Any:
-        for alias in (name, _OTHER_NAMES.get(name, name)):
+        for alias in (name, *_OTHER_NAMES.get(name, ())):
             found = episode.get(alias) if isinstance(episode, Mapping) else getattr(episode, alias, None)
             if found is not None:
                 return found
@@ -57,10 +63,18 @@ def _arrays_of(episode: Any, number: int) -> dict[str, np.ndarray]:
     if missing:
         what = f"episode {number} ({type(episode).__name__}) has no {', '.join(missing)}"
         raise ConfigError(what, key="source", hint="Give dictionaries of arrays, or episodes of Minari.")
+    done = next((name for name in AMBIGUOUS_NAMES if find(name) is not None), None)
+    if given["terminals"] is None and done is not None:
+        what = f"episode {number} has {done!r} and no terminals"
+        hint = (
+            f"Does {done!r} mix terminals (true ends) and timeouts (time limits)? Then give both apart; if it has terminals "
+            "only, call it 'terminals'."
+        )
+        raise ConfigError(what, key="terminals", hint=hint)
     if isinstance(given["observations"], Mapping):
         hint = "Flatten them into vectors; a dataset of Minari is given by its id, with flatten=True"
         raise DatasetFormatError(f"the observations of episode {number} are in parts", hint=hint, key="observations")
-    arrays = {name: np.asarray(value) for name, value in given.items() if value is not None}
+    arrays = {name: as_array(value, name, f"episode {number}") for name, value in given.items() if value is not None}
     for name in ("observations", "actions"):
         if arrays[name].ndim == 1:
             arrays[name] = arrays[name][:, None]
@@ -73,7 +87,9 @@ def _arrays_of(episode: Any, number: int) -> dict[str, np.ndarray]:
         arrays["observations"] = arrays["observations"][:-1]
     for name in _OTHER_NAMES:
         flags = arrays.get(name, np.zeros(n))
-        arrays[name] = read_flags(flags, name, f"episode {number}") if flags.ndim else flags[None]
+        if flags.ndim == 0:  # of the whole episode
+            flags = np.append(np.zeros(max(0, n - 1)), flags)
+        arrays[name] = read_flags(flags, name, f"episode {number}")
     lengths = {name: len(array) for name, array in arrays.items()}
     if n == 0 or len(set(lengths.values())) > 1:
         shown = ", ".join(f"{name} {length}" for name, length in lengths.items())

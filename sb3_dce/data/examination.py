@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from sb3_dce import hyperparams, theory
-from sb3_dce.data.catalog import DatasetSpec, spec_of_file
+from sb3_dce.data.catalog import DatasetSpec, is_id, spec_of_file
 from sb3_dce.data.layout import row_blocks
 from sb3_dce.data.loading import load_transitions
 from sb3_dce.data.quality import HUGE_REWARD, HUGE_VALUE
@@ -442,7 +442,7 @@ def _order_text(transitions: Transitions) -> str:
 
 
 def _duplicates_text(transitions: Transitions) -> str:
-    if "-cloned-" in transitions.info.id:
+    if is_id(transitions.info.id) and "-cloned-" in transitions.info.id:
         return "not counted: D4RL fills these sets up with copies of the demonstrations"
     return "at most 5 % of the rows repeat another row"
 

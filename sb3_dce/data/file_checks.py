@@ -16,6 +16,7 @@ from sb3_dce.errors import (
     DatasetSecurityError,
     SB3DCEError,
 )
+from sb3_dce.files import exists
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
@@ -30,7 +31,7 @@ def read_head(path: Path) -> bytes:
     :raises DatasetFormatError: if it is a folder, a zip archive or a pickle
     :raises DatasetError: if it may not be read
     """
-    if not path.exists():
+    if not exists(path):
         raise DatasetNotFoundError("no such file", where=str(path), hint="Check the path", path=path)
     if path.is_dir():
         raise DatasetFormatError("a folder, not a file", where=str(path), hint="Name one .hdf5 file in it", path=path)

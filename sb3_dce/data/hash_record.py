@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
@@ -102,7 +103,7 @@ def read_record(path: Path) -> HashRecord | None:
     :raises DatasetIntegrityError: if the record cannot be read
     """
     file = record_path(path)
-    if not file.is_file():
+    if not os.path.isfile(file):  # False, too, where the folder may not be entered
         return None
     try:
         with open(file, "rb") as stream:

@@ -114,6 +114,13 @@ class D4RLFile:
             self._stat = os.stat(self.path)
             try:
                 self._file = h5py.File(self.path, "r", locking="best-effort", rdcc_nbytes=0)  # whole chunks are read
+            except BlockingIOError as exc:
+                raise DatasetIntegrityError(
+                    "another program has opened the file for writing",
+                    where=str(self.path),
+                    hint="Wait until it has finished",
+                    path=self.path,
+                ) from exc
             except OSError as exc:
                 raise not_hdf5(self.path, head, self._again) from exc
         try:

@@ -56,6 +56,26 @@ class ArraySource(Protocol):
         """
 
 
+def as_array(value: Any, key: str, where: str = "") -> np.ndarray:
+    """
+    :param value: what a user gives for an array
+    :param key: its name
+    :param where: what it is part of, for the message
+    :return: the array
+    :raises DatasetFormatError: if NumPy cannot make one of it
+    """
+    try:
+        return np.asarray(value)
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise DatasetFormatError(
+            f"{key} is no array ({str(error).splitlines()[0]})",
+            where=where,
+            hint="Give one row per step; a list of episodes is [{'observations': ..., ...}, ...], and a tensor of PyTorch "
+            "becomes an array by .detach().cpu().numpy()",
+            key=key,
+        ) from error
+
+
 @dataclass(frozen=True)
 class RowLayout:
     """

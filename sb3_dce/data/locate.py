@@ -17,7 +17,7 @@ from pathlib import Path
 from sb3_dce.data.catalog import DatasetSpec, all_specs, resolve, spec_of_file
 from sb3_dce.data.minari import find_minari, is_minari_name
 from sb3_dce.errors import ConfigError, DatasetError, DatasetFormatError, DatasetNotFoundError
-from sb3_dce.files import expanded
+from sb3_dce.files import exists, expanded
 
 DATASETS_VARIABLE = "SB3_DCE_DATASETS"
 SUFFIXES = (".hdf5", ".h5", ".npz", ".csv", ".parquet")
@@ -38,7 +38,7 @@ def find_file(name_or_path: str | PathLike[str]) -> tuple[Path, DatasetSpec | No
         return find_minari(name_or_path).file, None
     if is_path(name_or_path):
         path = expanded(name_or_path)
-        if not path.exists():
+        if not exists(path):
             raise DatasetNotFoundError("no such file", where=str(path), hint=_available_hint(), path=path)
         return path, spec_of_file(path)
     spec = resolve(os.fspath(name_or_path))
@@ -113,7 +113,7 @@ def require_file(path: str | PathLike[str]) -> Path:
     :raises DatasetError: if it may not be read
     """
     path = Path(path)
-    if not path.exists():
+    if not exists(path):
         raise DatasetNotFoundError("no such file", where=str(path), hint="Check the path", path=path)
     if not path.is_file():
         raise DatasetFormatError("not a file", where=str(path), hint="Name a file", path=path)

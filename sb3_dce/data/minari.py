@@ -140,7 +140,7 @@ def folder_of(path: str | PathLike[str]) -> Path | None:
     path = expanded(path)
     if path.name in (METADATA_FILE, HDF5_FILE):
         path = path.parent
-    return next((folder for folder in (path, path / "data") if (folder / METADATA_FILE).is_file()), None)
+    return next((folder for folder in (path, path / "data") if os.path.isfile(folder / METADATA_FILE)), None)
 
 
 def observation_leaves(dataset: MinariDataset, flatten: Flatten) -> list[Leaf]:

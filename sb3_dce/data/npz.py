@@ -66,6 +66,24 @@ def text_from_npz(path: str | PathLike[str], key: str) -> str | None:
     :param key: name of a member without dimensions, as :func:`write_npz` stores a text
     :return: the text, empty if the member holds something else; ``None`` if it is not there
     """
+    value = _small_member(path, key)
+    if value is None:
+        return None
+    return str(value) if value.dtype.kind == "U" and value.shape == () else ""
+
+
+def flag_from_npz(path: str | PathLike[str], key: str) -> bool:
+    """
+    :param path: file that :func:`arrays_from_npz` has read
+    :param key: name of a member without dimensions, as :func:`write_npz` stores a truth value
+    :return: whether it is there and true
+    """
+    value = _small_member(path, key)
+    return value is not None and value.dtype.kind in "biu" and value.shape == () and bool(value)
+
+
+def _small_member(path: str | PathLike[str], key: str) -> np.ndarray | None:
+    """A member as an array, empty if it is large or none; ``None`` if it is not there."""
     with _zip_errors(Path(path)), zipfile.ZipFile(path) as archive:
         infos = {info.filename: info for info in archive.infolist()}
         info = infos.get(f"{key}.npy")
@@ -74,10 +92,9 @@ def text_from_npz(path: str | PathLike[str], key: str) -> str | None:
         with archive.open(info) as stream:
             head = io.BytesIO(stream.read(_MAX_TEXT_BYTES))
     try:
-        value = npy.read_array(head, allow_pickle=False, max_header_size=_MAX_HEADER_BYTES)
+        return npy.read_array(head, allow_pickle=False, max_header_size=_MAX_HEADER_BYTES)
     except (ValueError, TypeError, SyntaxError, tokenize.TokenError, MemoryError, RecursionError):
-        return ""
-    return str(value) if value.dtype.kind == "U" and value.shape == () else ""
+        return np.empty(0)
 
 
 def npz_keys(path: str | PathLike[str]) -> list[str]:

@@ -16,6 +16,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from sb3_dce.data.memory import require_memory
+
 _SEPARATORS = ",;\t|"
 _BLOCK_BYTES = 2**23
 _FLAG_WORDS = {"false": "0", "true": "1"}
@@ -77,6 +79,7 @@ def read_plain(
         n_rows = _count_rows(file, sep, n_columns)
         if not n_rows:
             return None
+        require_memory(8 * n_rows * len(cells), f"{n_rows:,} rows", str(path), "Use part of the data")
         file.seek(len(head))
         return _parse(file, sep, n_rows, cells, flag_cells, id_cells)
 

@@ -7,6 +7,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from numbers import Real
 from pathlib import Path
 from typing import Any, Literal
 
@@ -69,13 +70,15 @@ class ReadOptions:
                 key="action_scale",
                 hint="Give the bounds of the action space, or the rule, not both",
             )
-        number = isinstance(self.action_scale, int | float) and not isinstance(self.action_scale, bool)
+        number = isinstance(self.action_scale, Real) and not isinstance(self.action_scale, bool)  # also NumPy's
         if not (self.action_scale == "data" or (number and 0 < float(self.action_scale) < float("inf"))):
             raise ConfigError(
                 f"action_scale must be 'data' or a number above 0, got {self.action_scale!r}",
                 key="action_scale",
                 hint="100.0 means actions in [-100, 100]",
             )
+        if number:
+            object.__setattr__(self, "action_scale", float(self.action_scale))
 
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> ReadOptions:

@@ -96,7 +96,7 @@ def arrays_from_csv(
     :raises ConfigError: if ``sep`` is not one character
     """
     path = require_file(path)
-    if len(sep) != 1:
+    if not isinstance(sep, str) or len(sep) != 1:
         raise ConfigError(f"must be one character, got {sep!r}", where="sep", hint="Usual are ',' ';' and '\\t'", key="sep")
     _check_size(os.path.getsize(path), max_bytes, path)
     try:
@@ -205,6 +205,9 @@ def _stem_and_number(name: Any) -> tuple[str, int | None]:
 
 
 def _by_mapping(names: Sequence[Any], columns: Columns, where: str) -> dict[str, list[int]]:
+    if not isinstance(columns, Mapping):
+        what = f"columns must map keys to column names, got {type(columns).__name__}"
+        raise ConfigError(what, hint="For example columns={'observations': ['a', 'b'], 'rewards': 'r'}.", key="columns")
     found = {}
     for key, given in columns.items():
         chosen = [given] if isinstance(given, str) or not isinstance(given, Iterable) else list(given)

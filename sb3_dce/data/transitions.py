@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from sb3_dce.data.build import BuiltRows, build_rows
-from sb3_dce.data.catalog import DatasetSpec, normalized_score
+from sb3_dce.data.catalog import DatasetSpec, is_id, normalized_score
 from sb3_dce.data.hash_record import verify_hash
 from sb3_dce.data.hashes import content_hash, file_sha256
 from sb3_dce.data.hdf5 import D4RLFile, write_hdf5
-from sb3_dce.data.layout import CORE_KEYS, EPISODES, INCOMPLETE, ArraySource, RowLayout, wanted_keys
+from sb3_dce.data.layout import CORE_KEYS, EPISODES, INCOMPLETE, ArraySource, RowLayout, as_array, wanted_keys
 from sb3_dce.data.minari import METADATA_FILE, Flatten, action_bounds, find_minari, reward_findings
 from sb3_dce.data.minari_episodes import open_episodes
-from sb3_dce.data.npz import arrays_from_npz, npz_keys, text_from_npz, write_npz
+from sb3_dce.data.npz import arrays_from_npz, flag_from_npz, npz_keys, text_from_npz, write_npz
 from sb3_dce.data.records import BOUNDS_ATTRIBUTE, DatasetInfo, ReadOptions, bounds_attribute
 from sb3_dce.data.row_cache import cached_rows
 from sb3_dce.data.sb3_buffer import arrays_from_replay_buffer, load_saved_buffer
@@ -129,9 +129,9 @@ class Transitions:
         :raises DatasetError: if the shapes or types do not fit, or the numbers make no sense
         """
         given = zip(CORE_KEYS, (observations, actions, rewards, terminals, timeouts, next_observations), strict=True)
-        sources = {key: np.asarray(array) for key, array in given if array is not None}
+        sources = {key: as_array(array, key) for key, array in given if array is not None}
         if episodes is not None:
-            sources[EPISODES] = numbered(np.asarray(episodes))
+            sources[EPISODES] = numbered(as_array(episodes, EPISODES))
         dataset_id = spec.id if spec else "arrays"
         return cls._build(sources, dataset_id, None, sources, spec, ReadOptions.of(options))
 
@@ -149,7 +149,9 @@ class Transitions:
         read_options = ReadOptions.of(options)
 
         def read() -> dict[str, np.ndarray]:
-            return arrays_from_npz(path, max_bytes=read_options.max_bytes)
+            arrays = arrays_from_npz(path, max_bytes=read_options.max_bytes)
+            _refuse_false_name(spec, flag_from_npz(path, "generated"), Path(path))
+            return arrays
 
         def bounded() -> ReadOptions:
             return read_options.with_bounds_of(text_from_npz(path, BOUNDS_ATTRIBUTE), str(path))
@@ -432,10 +434,8 @@ class Transitions:
         if len(returns) == 0:
             return "no whole episode, so no returns"
         text = f"returns min {returns.min():.1f}, mean {returns.mean():.1f}, max {returns.max():.1f}"
-        try:
+        if is_id(info.id):  # an alias is no claim
             text += f" (mean score {normalized_score(info.id, returns.mean()):.1f})"
-        except DatasetError:  # not a dataset of the catalogue, so there are no reference scores
-            pass
         return f"{text}; lengths {lengths.min()} to {lengths.max()}, mean {lengths.mean():.1f}"
 
     @property
@@ -445,15 +445,20 @@ class Transitions:
 
 def _rows_of_hdf5(path: Path, spec: DatasetSpec | None, options: ReadOptions) -> BuiltRows:
     with D4RLFile(path, max_bytes=options.max_bytes, url=spec.url if spec else None) as file:
-        if spec is not None and not spec.generated and file.attributes().get("generated", False):
-            raise DatasetSemanticsError(
-                f"the file carries the attribute generated = true, so it is not the official {spec.id}",
-                where=str(path),
-                hint="Give it its own name, such ids end in -sb3",
-            )
+        _refuse_false_name(spec, bool(file.attributes().get("generated", False)), path)
         options = options.with_bounds_of(file.attributes().get(BOUNDS_ATTRIBUTE), str(path))
         dataset_id, sources = spec.id if spec else path.stem, file.select(wanted_keys(file.keys))
         return build_rows(sources, dataset_id=dataset_id, path=path, found_keys=file.keys, spec=spec, options=options)
+
+
+def _refuse_false_name(spec: DatasetSpec | None, generated: bool, path: Path) -> None:
+    """What this package has made does not pass for a file of D4RL."""
+    if generated and spec is not None and not spec.generated:
+        raise DatasetSemanticsError(
+            f"the file carries the attribute generated = true, so it is not the official {spec.id}",
+            where=str(path),
+            hint="Give it its own name, such ids end in -sb3",
+        )
 
 
 def _check_hash(path: Path, spec: DatasetSpec) -> None:

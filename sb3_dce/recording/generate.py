@@ -20,7 +20,7 @@ from sb3_dce.data.catalog import DatasetSpec, all_specs, resolve
 from sb3_dce.data.hashes import file_sha256
 from sb3_dce.data.hdf5 import D4RLFile, write_hdf5
 from sb3_dce.data.layout import CORE_KEYS
-from sb3_dce.data.locate import search_folders
+from sb3_dce.data.locate import cache_folder, search_folders
 from sb3_dce.data.transitions import Transitions
 from sb3_dce.errors import ConfigError, DatasetError, DatasetNotFoundError
 from sb3_dce.files import expanded
@@ -219,7 +219,7 @@ def generate(
                 key=name,
                 hint=_SOURCE_HINTS[recipe.source].format(task=recipe.task),
             )
-    where = folder or search_folders()[0]
+    where = folder or (search_folders() or [cache_folder()])[0]
     job = _Job(recipe, where, sources, training or Training(), rows, seed, workers, force, progress, note)
     check_target(job.out, recipe.dataset.id, recipe.dataset.id, force)
     return {"random": _from_policy, "policy": _from_policy, "buffer": _from_buffer, "parts": _from_parts}[recipe.source](job)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import sb3_dce
-from sb3_dce.data.catalog import normalized_score
+from sb3_dce.data.catalog import is_id, normalized_score
 from sb3_dce.data.examination import VERDICTS, Check, Examination, examine, file_hash
 from sb3_dce.data.hdf5 import D4RLFile
 from sb3_dce.data.transitions import Transitions
@@ -171,10 +171,7 @@ def _header(transitions: Transitions) -> str:
 
 
 def _score(dataset_id: str, value: float) -> float | None:
-    try:
-        return float(normalized_score(dataset_id, value))
-    except DatasetError:  # not a dataset of the catalogue, so there are no reference scores
-        return None
+    return float(normalized_score(dataset_id, value)) if is_id(dataset_id) else None  # an alias is no claim
 
 
 def _source(transitions: Transitions) -> str:

@@ -94,6 +94,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("-optimize", "--optimize-hyperparameters", action="store_true")
     parser.add_argument("-params", "--hyperparams", nargs="+", default=[])
     parser.add_argument("--gym-packages", nargs="+", default=[])
+    parser.add_argument("-conf", "--conf-file", default=None)
     return parser.parse_known_args(arguments)[0]
 
 
@@ -112,12 +113,28 @@ def _prepare_training(options: argparse.Namespace, arguments: list[str], cleanup
     hyperparams.check_keys(AGENTS[options.algo], overrides, where="--hyperparams")
     # argparse accepts abbreviations: -c, -conf, --conf, --conf-file
     configured = any(argument.startswith(("-c", "--c")) for argument in arguments)
+    if options.conf_file is not None and options.conf_file.endswith((".yml", ".yaml")):
+        _check_row(options.algo, options.env, Path(options.conf_file))
     is_dataset = options.env in {spec.id for spec in catalog.all_specs()}
     if is_dataset:
         _check_simulator(options)
         if not configured and "dataset" not in overrides:
             locate.find_file(options.env)
     return [] if configured else ["-conf", _configuration(options.algo, options.env, is_dataset, cleanup)]
+
+
+def _check_row(algo: str, env_id: str, file: Path) -> None:
+    """A row of the user's own: its names, before rl_zoo3 builds anything from it."""
+    try:
+        rows = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        hint = "Give a YAML file with one row per environment, as the packaged ones."
+        raise ConfigError(f"the file cannot be read: {error}", where=str(file), key="-conf", hint=hint) from error
+    row = None if not isinstance(rows, dict) else rows.get(env_id, rows.get("default"))
+    if not isinstance(row, dict):
+        hint = f"Add {env_id}: with its parameters, or a row called default."
+        raise ConfigError(f"the file has no row for {env_id}", where=str(file), key="-conf", hint=hint)
+    hyperparams.check_keys(AGENTS[algo], row, where=str(file))
 
 
 def _check_simulator(options: argparse.Namespace) -> None:

@@ -160,6 +160,7 @@ def register() -> dict[str, type[BaseAlgorithm]]:
     :return: all algorithms rl_zoo3 knows now
     :raises ModuleNotFoundError: without rl_zoo3
     """
+    import rl_zoo3.import_envs  # noqa: F401  # registers the environments that its scripts know
     from rl_zoo3 import ALGOS
     from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
