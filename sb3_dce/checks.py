@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from numbers import Integral, Real
 from typing import Any
 
@@ -129,3 +129,12 @@ def check_ends_with_evaluation(n_updates: int, eval_freq: int, whose: str = "") 
             key="--updates",
             hint=f"Take a multiple of {eval_freq}, or another --eval-freq.",
         )
+
+
+def changed_settings(there: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """
+    :param there: settings of what was begun
+    :param now: settings that are asked for
+    :return: a text for each of ``now`` that was another
+    """
+    return [f"{key}={there.get(key)!r} there, {value!r} now" for key, value in now.items() if there.get(key) != value]

@@ -13,6 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_dce.agents import agent_class
 from sb3_dce.base import OfflineAlgorithm
+from sb3_dce.checks import changed_settings
 from sb3_dce.configuration import NOT_HYPERPARAMETERS, settings_in_force
 from sb3_dce.data import find_file
 from sb3_dce.data.hashes import sha256_once
@@ -190,11 +191,10 @@ def refuse_other_run(spec: RunSpec, folder: Path) -> None:
     parts = (config.get(name) for name in ("run", "dataset", "hyperparameters"))
     begun, data, settings = (part if isinstance(part, dict) else {} for part in parts)
     wanted = plain(settings_of_run(spec))
-    differing = [key for key in wanted if key not in ("n_updates", "dataset") and begun.get(key) != wanted[key]]
-    length = begun.get("n_updates")
-    if _reached(folder) > spec.n_updates or (length != wanted["n_updates"] and _depends_on_length(settings)):
-        differing.append("n_updates")
-    changes = [f"{key}={begun.get(key)!r} there, {wanted[key]!r} now" for key in differing]
+    del wanted["dataset"]
+    if _reached(folder) <= spec.n_updates and not _depends_on_length(settings):
+        del wanted["n_updates"]
+    changes = changed_settings(begun, wanted)
     if not changes:
         row = data.get("row", catalogue_id(data.get("name")))
         changes = _changed_hyperparameters(settings, settings_in_force(spec.algo, row, spec.overrides))

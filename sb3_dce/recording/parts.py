@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_dce.checks import changed_settings
 from sb3_dce.data.npz import arrays_from_npz, write_npz
 from sb3_dce.errors import CheckpointError, ConfigError, DatasetError
 from sb3_dce.files import write_text
@@ -97,11 +98,9 @@ class Parts:
             raise CheckpointError(
                 "the file is damaged", where=str(self._settings_file), hint="Delete its folder; the recording begins anew."
             ) from error
-        differing = [key for key in self.settings if written.get(key) != self.settings[key]]
-        if differing:
-            changes = ", ".join(f"{key}={written.get(key)!r} there, {self.settings[key]!r} now" for key in differing)
+        if changes := changed_settings(written, self.settings):
             raise ConfigError(
-                f"the folder holds an interrupted recording with other settings: {changes}",
+                f"the folder holds an interrupted recording with other settings: {', '.join(changes)}",
                 where=str(self.folder),
                 path=self.folder,
                 hint="Give those settings again to go on, or delete the folder (--force does).",

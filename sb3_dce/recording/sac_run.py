@@ -18,6 +18,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_dce.checks import changed_settings
 from sb3_dce.data.npz import arrays_from_npz, write_npz
 from sb3_dce.envs import make_env
 from sb3_dce.errors import CheckpointError, ConfigError
@@ -231,11 +232,9 @@ class SACRun:
             raise CheckpointError(
                 f"damaged ({error})", where=str(path), path=path, hint="Delete the folder; the run starts anew."
             ) from error
-        differing = [key for key in self._config if begun.get(key) != self._config[key]]
-        if differing:
-            changes = ", ".join(f"{key}={begun.get(key)!r} there, {self._config[key]!r} now" for key in differing)
+        if changes := changed_settings(begun, self._config):
             raise ConfigError(
-                f"the folder holds a run with other settings: {changes}",
+                f"the folder holds a run with other settings: {', '.join(changes)}",
                 where=str(self.folder),
                 path=self.folder,
                 hint="Give those settings again, or delete the folder.",
