@@ -501,3 +501,36 @@ def test_report_from_rows_alone_is_the_same_every_time(tmp_path: Path) -> None:
     assert "![Ablation of beta](figures/fig-beta.png)" in page and "sha256 abababab…" in page
     assert "## The paper's claims" in page and "**held**" in page and "**could not be tested**" in page
     assert not (tmp_path / "a" / "runs").exists(), "nothing is trained"
+
+
+def test_runs_of_a_schedule_that_parts_later_are_those_of_the_constant() -> None:
+    alpha = load_experiment("fig-alpha")
+    walker = "walker2d-medium-sb3"  # its row begins with beta 4 and the learned temperature, as on HalfCheetah
+    for n_updates, shown in ((50_000, True), (150_000, False)):
+        curves = {"ent_coef": [0.1] * 10, "score": [30.0] * 10}
+        rows = run_rows(TABLE, "DCE", walker, 0, curves=curves, n_updates=n_updates)
+        evidence = evidence_of(rows, "fig-alpha")
+        assert (evidence.tail(alpha.variant("beta 4"), walker, "ent_coef") == 0.1) is shown
+        assert len(evidence.runs(alpha.variant("beta 2"), walker)) == 0
+        assert (len(evidence_of(rows).last(TABLE.variant("DCE one setting"), walker)) == 1) is shown
+    own = run_rows(alpha, "beta 4", walker, 0, curves={"ent_coef": [0.3] * 10}, n_updates=50_000)
+    rows = results.merge([run_rows(TABLE, "DCE", walker, 0, curves=curves, n_updates=50_000), own])
+    evidence = evidence_of(rows, "fig-alpha")
+    assert evidence.tail(alpha.variant("beta 4"), walker, "ent_coef") == 0.3, "its own runs count first"
+    assert aggregate_tables(evidence_of(rows))["sb3"].rows[-1][0] == "DCE", "no agent stands there twice"
+
+
+def test_what_is_no_cause_of_a_loss_is_said_too() -> None:
+    experiment = load_experiment("why-dce-loses")
+    hopper = "hopper-medium-sb3"
+    curves = {"survival_margin": [1.5, 1.4], "score": [10.0, 20.0, 30.0, 28.0, 9.0, 2.0, 1.0, 1.0, 1.0, 1.0]}
+    dce = run_rows(experiment, "DCE", hopper, 0, curves=curves, n_updates=50_000)
+    fact = dce.iloc[:1].assign(metric="data_n_terminals", step=0, value=7.0)
+    longer = [run_rows(experiment, "DCE", hopper, seed, 50.0 + seed, n_updates=100_000) for seed in range(2)]
+    rival = run_rows(experiment, "IQL", hopper, 0, 12.0, n_updates=50_000)
+    rows = pd.concat([results.merge([rival, *longer]), dce, fact], ignore_index=True)
+    finding = cell(make_report(evidence_of(rows, "why-dce-loses")).tables["changes"], hopper, "finding")
+    assert finding == (
+        "behind IQL by 11.0, which seeds can do: falling (13.0 in the middle of the run); 50.5 after 100,000 steps (2 seeds); "
+        "no change was run; survival condition kept (margin 1.40)"
+    )

@@ -9,10 +9,9 @@ from __future__ import annotations
 import numpy as np
 
 from sb3_dce.experiments.evidence import Evidence
-from sb3_dce.experiments.grid import Variant, settings_in_force
+from sb3_dce.experiments.grid import Variant
 from sb3_dce.experiments.judging import CLEARLY, CLOSE, differs, uncertainty
 from sb3_dce.experiments.text_table import TextTable
-from sb3_dce.schedules import StepSchedule
 
 # A change counts as a cause if it closes this share of the distance to the better of BC and IQL.
 SHARE = 0.5
@@ -45,7 +44,8 @@ def variant_table(evidence: Evidence) -> TextTable:
         f"Each column after DCE changes one thing of the paper's row. A change is named as a cause if it closes at least "
         f"{SHARE:.0%} of the distance between DCE and the better of BC and IQL, and is clearly better ({CLEARLY}). One that "
         "is none over the length of the runs (a constant beta, before the first change of the row's schedule) differs by "
-        "rounding alone and is not counted."
+        "rounding alone and is not counted. Rising and falling are the same share between the middle and the end of the run; "
+        "the survival condition is that the mean reward exceeds beta_eff."
     )
     return TextTable(header, tuple(rows), f"{evidence.caption([n for _, n in evidence.table_rows()])} {note}")
 
@@ -91,15 +91,17 @@ def verdict_of(evidence: Evidence, dataset_id: str) -> str:
     best = max(rivals, key=rivals.__getitem__)
     variant = experiment.variant("DCE")
     own = uncertainty(evidence, variant, dataset_id)
-    if dce >= rivals[best]:
-        return f"not behind ({best} {rivals[best]:.1f})"
-    if differs(rivals[best] - dce, uncertainty(evidence, experiment.variant(best), dataset_id), own) == CLOSE:
-        return f"not clearly behind ({best} {rivals[best]:.1f})"
-    causes = []
-    margin = lowest_margin(evidence, variant, dataset_id)
-    if (evidence.start(variant, dataset_id, "data_n_terminals") or 0) > 0 and margin is not None and margin < 0:
-        causes.append(f"survival condition broken (margin {margin:.2f})")
     gap = rivals[best] - dce
+    if gap <= 0:
+        return f"not behind ({best} {rivals[best]:.1f})"
+    close = differs(gap, uncertainty(evidence, experiment.variant(best), dataset_id), own) == CLOSE
+    causes, excluded = [], []
+    margin = lowest_margin(evidence, variant, dataset_id)
+    if (evidence.start(variant, dataset_id, "data_n_terminals") or 0) > 0 and margin is not None:
+        if margin < 0:
+            causes.append(f"survival condition broken (margin {margin:.2f})")
+        else:
+            excluded.append(f"survival condition kept (margin {margin:.2f})")
     changes = [v for v in experiment.variants if v.algo == variant.algo and not _is_same(evidence, v, variant, dataset_id)]
     changed = {v.name: score for v in changes if (score := scores[v.name]) is not None}
     for v in changes:
@@ -109,22 +111,19 @@ def verdict_of(evidence: Evidence, dataset_id: str) -> str:
         if differs(score - dce, uncertainty(evidence, v, dataset_id), own) is True:
             causes.append(f"{name} closes {(score - dce) / gap:.0%}")
     half, end = halves(evidence, variant, dataset_id)
-    if half is not None and end is not None and end - half >= SHARE * gap:
-        causes.append(f"still rising ({half:.1f} in the middle of the run)")
-    nothing = "none of the changes explains it" if changed else "no change was run"
-    return f"behind {best} by {gap:.1f}: {'; '.join(causes) or nothing}"
+    if half is not None and end is not None and abs(end - half) >= SHARE * gap:
+        causes.append(f"{'still rising' if end > half else 'falling'} ({half:.1f} in the middle of the run)")
+    if (longer := evidence.last_of_longer(variant, dataset_id)) is not None:
+        causes.append(f"{longer[0].mean():.1f} after {longer[1]:,} steps ({len(longer[0])} seeds)")
+    if not causes or not changed:
+        excluded.insert(0, "none of the changes explains it" if changed else "no change was run")
+    behind = f"behind {best} by {gap:.1f}" + (", which seeds can do" if close else "")
+    return f"{behind}: {'; '.join([*causes, *excluded])}"
 
 
 def _is_same(evidence: Evidence, one: Variant, other: Variant, dataset_id: str) -> bool:
     """Whether two variants of DCE are the same agent over the length of the runs, whatever their schedules do later."""
-    settings = [settings_in_force(v, dataset_id, evidence.scale) for v in (one, other)]
-    schedules = []
-    for each in settings:
-        schedules.append(StepSchedule.of(each))
-        for name in ("beta", "beta_final", "beta_rate", "beta_update_every", "steps_per_epoch"):
-            del each[name]
-    n_updates = evidence.n_updates(dataset_id) or 1
-    return settings[0] == settings[1] and schedules[0].changes(n_updates) == schedules[1].changes(n_updates)
+    return evidence.key_of(one, dataset_id) == evidence.key_of(other, dataset_id)
 
 
 def lowest_margin(evidence: Evidence, variant: Variant, dataset_id: str) -> float | None:

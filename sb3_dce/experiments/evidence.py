@@ -8,12 +8,15 @@ has only others are shown as what they are (:meth:`Evidence.of_other_length`) an
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable
 from functools import cached_property
 
 import numpy as np
 import pandas as pd
 
+from sb3_dce import configuration
+from sb3_dce.configuration import config_hash
 from sb3_dce.data.catalog import resolve
 from sb3_dce.experiments.grid import (
     EMBEDDED,
@@ -21,6 +24,7 @@ from sb3_dce.experiments.grid import (
     GridDataset,
     Scale,
     Variant,
+    agent_key,
     settings_in_force,
     source_of,
     variant_hash,
@@ -144,8 +148,12 @@ class Evidence:
             return self._selected[dataset_id]
         keys = {(dataset_id, v.algo, variant_hash(v, dataset_id, self.scale)) for v in self.experiment.variants}
         parts = [self._groups[key] for key in sorted(keys) if key in self._groups]
-        found = pd.concat(parts) if parts else self._rows.iloc[:0]
-        runs = found[["dataset_sha256", "agent", "config_hash", "n_updates", "seed"]].drop_duplicates()
+        again = [part for v in self.experiment.variants for part in self._of_the_same_agent(v, dataset_id)]
+        found = pd.concat([*parts, *again]) if parts or again else self._rows.iloc[:0]
+        runs, once = (
+            rows[["dataset_sha256", "agent", "config_hash", "n_updates", "seed"]].drop_duplicates()
+            for rows in (found, pd.concat(parts) if parts else found.iloc[:0])
+        )
         if len(runs):
             sha = _commonest(runs["dataset_sha256"])
             if (runs["dataset_sha256"] != sha).any():
@@ -158,19 +166,52 @@ class Evidence:
                 cells = ours.drop_duplicates(["agent", "config_hash", "n_updates"])["n_updates"].value_counts()
                 length = int(max(cells.index, key=lambda n: (cells[n], n)))
             taken = (found["dataset_sha256"] == sha) & (found["n_updates"] == length)
-            self.left_out += int((runs["dataset_sha256"] != sha).sum())
+            self.left_out += int((once["dataset_sha256"] != sha).sum())
             self._others[dataset_id] = found[(found["dataset_sha256"] == sha) & ~taken]
-            other = ours[ours["n_updates"] != length]["n_updates"].value_counts()
+            other = once[(once["dataset_sha256"] == sha) & (once["n_updates"] != length)]["n_updates"].value_counts()
             self.of_other_lengths[dataset_id] = {int(n): int(k) for n, k in other.items()}  # type: ignore[call-overload]
             found = found[taken]
         self._selected[dataset_id] = found
         return found
 
+    def _of_the_same_agent(self, variant: Variant, dataset_id: str) -> list[pd.DataFrame]:
+        """
+        Where a variant has no runs of a length: those of another configuration that is the same agent over this length, under
+        its hash. Of several the one with the most seeds: runs of two precisions are not put together.
+        """
+        wanted, settings = variant_hash(variant, dataset_id, self.scale), settings_in_force(variant, dataset_id, self.scale)
+        own = self._groups.get((dataset_id, variant.algo, wanted), self._rows.iloc[:0])
+        known = set(own[["dataset_sha256", "n_updates"]].itertuples(index=False, name=None))
+        found: dict[tuple[str, int], pd.DataFrame] = {}
+        for (data, algo, digest), rows in self._groups.items():
+            if data != dataset_id or algo != variant.algo or digest == wanted:
+                continue
+            theirs = configuration.settings_in_force(algo, dataset_id, json.loads(rows["hyperparameters"].iloc[0]))
+            if config_hash(algo, theirs) != digest:
+                continue  # made with another row of the hyperparameter file
+            for sha, n_updates in rows[["dataset_sha256", "n_updates"]].drop_duplicates().itertuples(index=False, name=None):
+                key = (sha, n_updates)
+                if key in known or agent_key(algo, theirs, n_updates) != agent_key(algo, settings, n_updates):
+                    continue
+                part = rows[(rows["dataset_sha256"] == sha) & (rows["n_updates"] == n_updates)].assign(config_hash=wanted)
+                if key not in found or part["seed"].nunique() > found[key]["seed"].nunique():
+                    found[key] = part
+        return list(found.values())
+
+    def key_of(self, variant: Variant, dataset_id: str) -> str:
+        """
+        :param variant: of the experiment
+        :param dataset_id: data
+        :return: the same text for variants that are one agent over the length of the runs there
+        """
+        settings = settings_in_force(variant, dataset_id, self.scale)
+        return agent_key(variant.algo, settings, self.n_updates(dataset_id) or 1)
+
     def runs(self, variant: Variant, dataset_id: str) -> pd.DataFrame:
         """
         :param variant: of the experiment
         :param dataset_id: data
-        :return: rows of its runs
+        :return: rows of its runs, also those of another variant that is the same agent over their length
         """
         key = (variant.name, dataset_id)
         if key not in self._runs:
@@ -192,6 +233,20 @@ class Evidence:
             rows = rows[(rows["agent"] == variant.algo) & (rows["config_hash"] == wanted)]
             rows = rows[rows["n_updates"] == rows["n_updates"].max()]
         return rows
+
+    def last_of_longer(self, variant: Variant, dataset_id: str) -> tuple[np.ndarray, int] | None:
+        """
+        :param variant: of the experiment
+        :param dataset_id: data
+        :return: scores at the end of its longest runs, and their gradient steps, if these are more than the others have
+        """
+        rows = self._others.get(dataset_id, self._rows.iloc[:0])
+        wanted = variant_hash(variant, dataset_id, self.scale)
+        rows = rows[(rows["agent"] == variant.algo) & (rows["config_hash"] == wanted)]
+        rows = rows[rows["n_updates"] > (self.n_updates(dataset_id) or 0)]
+        rows = rows[rows["n_updates"] == rows["n_updates"].max()]
+        scores = at_end(rows, "score")
+        return (scores, int(rows["n_updates"].iloc[0])) if len(scores) else None
 
     def n_updates(self, dataset_id: str) -> int | None:
         """

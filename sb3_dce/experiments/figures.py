@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
+from sb3_dce.data.catalog import resolve
 from sb3_dce.errors import ConfigError
 from sb3_dce.experiments.curves import panel_curves, variants_of
 from sb3_dce.experiments.evidence import UPDATES_PER_EPOCH, Evidence
@@ -123,6 +124,8 @@ def _panel(evidence: Evidence, panel: Panel, axes: Axes) -> None:
     if panel.scale != "linear":
         axes.set_yscale(panel.scale)
     axes.grid(alpha=0.3)
+    if panel.metric == "score" and curves and (dataset_id := evidence.id_of(panel.dataset)) is not None:
+        _add_returns(axes, dataset_id)
     if curves:
         for name in _missing(evidence, panel, curves):
             axes.plot([], [], linestyle="none", label=f"{name}: no curve")
@@ -130,6 +133,20 @@ def _panel(evidence: Evidence, panel: Panel, axes: Axes) -> None:
     else:
         axes.set(xticks=[], yticks=[])
         axes.text(0.5, 0.5, _absence(evidence, panel), ha="center", va="center", transform=axes.transAxes, color="0.4")
+
+
+def _add_returns(axes: Axes, dataset_id: str) -> None:
+    """The paper's axis, on the right of the scores."""
+    spec = resolve(dataset_id)
+    low, span = spec.ref_min_score, spec.ref_max_score - spec.ref_min_score
+
+    def to_return(score: Any) -> Any:
+        return low + span * score / 100.0
+
+    def to_score(value: Any) -> Any:
+        return 100.0 * (value - low) / span
+
+    axes.secondary_yaxis("right", functions=(to_return, to_score)).set_ylabel("return", fontsize=9)
 
 
 def _colors(evidence: Evidence, panel: Panel, lines: list[str]) -> dict[str, str]:
@@ -142,15 +159,19 @@ def _data_title(evidence: Evidence, panel: Panel) -> str | None:
     """Id of the data shown; without runs that of those the scale would take."""
     if panel.over:
         return None
-    entry = evidence.entry(panel.dataset)
-    planned = entry.twin if evidence.scale.source == "twin" and entry.twin else entry.paper
-    return evidence.id_of(panel.dataset) or planned
+    return evidence.id_of(panel.dataset) or _planned_id(evidence, panel.dataset)
+
+
+def _planned_id(evidence: Evidence, paper: str | None) -> str:
+    """Id of the data that the scale would take."""
+    entry = evidence.entry(paper)
+    return entry.twin if evidence.scale.source == "twin" and entry.twin else entry.paper
 
 
 def _missing(evidence: Evidence, panel: Panel, curves: dict[str, tuple[pd.DataFrame, pd.Series | None]]) -> list[str]:
     """Lines that belong to a panel and have no runs."""
     if panel.over:
-        return [name for name in panel.over if evidence.id_of(name) not in curves]
+        return [_planned_id(evidence, name) for name in panel.over if evidence.id_of(name) not in curves]
     if panel.lines:
         return []
     return [name for name in variants_of(evidence, panel) if name not in curves]

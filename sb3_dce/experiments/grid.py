@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
@@ -27,6 +27,7 @@ from sb3_dce.data.catalog import resolve
 from sb3_dce.data.locate import known_dataset, search
 from sb3_dce.errors import ConfigError, DatasetNotFoundError
 from sb3_dce.run_files import RunSpec
+from sb3_dce.schedules import StepSchedule
 
 SCALES = ("smoke", "cpu", "full")
 EMBEDDED = "halfcheetah-tiny-sb3"
@@ -300,6 +301,25 @@ def settings_in_force(variant: Variant, dataset_id: str, scale: Scale | None = N
     :return: every argument of the agent's constructor
     """
     return configuration.settings_in_force(variant.algo, dataset_id, _overrides(variant, scale))
+
+
+# Parameters of the schedule of beta.
+_SCHEDULE = ("beta", "beta_final", "beta_rate", "beta_update_every", "steps_per_epoch")
+
+
+def agent_key(algo: str, settings: Mapping[str, Any], n_updates: int) -> str:
+    """
+    What an agent is over a number of updates: two schedules of beta that part later make one agent until then.
+
+    :param algo: name of the agent
+    :param settings: every argument of its constructor
+    :param n_updates: gradient steps
+    :return: the same text for the same agent
+    """
+    if not settings.keys() >= set(_SCHEDULE):
+        return config_hash(algo, dict(settings))
+    others = {key: value for key, value in settings.items() if key not in _SCHEDULE}
+    return f"{config_hash(algo, others)} {StepSchedule.of(settings).changes(n_updates)}"
 
 
 def source_of(dataset_id: str) -> str:

@@ -240,7 +240,9 @@ def lengths_and_seeds(evidence: Evidence, variant: Variant, dataset_ids: Iterabl
     return "; ".join(dict.fromkeys(scopes))
 
 
-def on_this_kind(claim: str, rule: str, holds: bool | str | None, values: Values | None, digits: int = 1) -> Verdict:
+def on_this_kind(
+    claim: str, rule: str, holds: bool | str | None, values: Values | None, digits: int = 1, *, absence: str = ""
+) -> Verdict:
     """
     What is claimed of a kind of data is not tested on another.
 
@@ -249,9 +251,10 @@ def on_this_kind(claim: str, rule: str, holds: bool | str | None, values: Values
     :param holds: outcome if the data are of this kind
     :param values: numbers
     :param digits: behind the point
+    :param absence: what is shown without numbers
     :return: verdict
     """
-    text = "" if values is None else values.text(digits)
+    text = absence if values is None else values.text(digits)
     if values is None or not values.other_kind:
         return judge(claim, rule, holds, text)
     return judge(claim, rule, None, f"{values.other_kind}: {text}")

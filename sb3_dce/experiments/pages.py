@@ -45,13 +45,16 @@ def write_page(path: Path, out: Path, evidences: Mapping[str, Evidence], reports
     every = [verdict for found in judged.values() for verdict in found]
     parts = [
         "# Results",
-        f"Made from the result rows in `{link}rows/` by `{command}`; no number of ours is typed by hand.",
+        f"Made from the result rows in `{link}rows/` by `{command}`; no score of ours is typed by hand.",
         "Data whose names end in `-sb3` are made with this package. They stand in for D4RL's sets and are not these: scores "
         "on them cannot be compared with published ones, which stand beside them in columns of their own, under the D4RL id "
         "they belong to. Scores are those of the last policy, with D4RL's constants, in the version 4 environments.",
         "The paper trains for 1,000,000 steps (500,000 in figures) with five seeds. How long and how often we did stands with "
         "each number. Its schedules change beta for the first time after 50,000 steps: shorter runs have the first beta "
         "throughout.",
+        *coverage(evidences),
+        '"Not run": there are no runs yet. "No data": this needs files of D4RL, which are not here, and has no stand-in '
+        '(Kitchen). "No curve": this line of a figure has no runs.',
         f"Verdicts in the sections of the experiments: {count(every)}.",
         f'In the rules below "clearly" means {CLEARLY}.',
         "## The paper's claims",
@@ -62,6 +65,28 @@ def write_page(path: Path, out: Path, evidences: Mapping[str, Evidence], reports
     for name, report in reports.items():
         parts += _section(name, evidences[name], report, link)
     write_text(path, "\n\n".join(part.strip("\n") for part in parts) + "\n")
+
+
+def coverage(evidences: Mapping[str, Evidence]) -> list[str]:
+    """
+    :param evidences: by experiment
+    :return: for each table how much of it has runs, in words
+    """
+    found = []
+    for evidence in (e for e in evidences.values() if e.experiment.report == "table"):
+        rows = evidence.table_rows()
+        agents: dict[int, list[str]] = {}
+        for variant in evidence.experiment.variants:
+            if variant.paper is not None:
+                n = sum(
+                    len(evidence.runs(variant, name)) > 0 or evidence.of_other_length(variant, name).size > 0
+                    for _, name in rows
+                )
+                agents.setdefault(n, []).append(variant.name)
+        of = len(evidence.experiment.datasets)
+        counts = "; ".join(f"{', '.join(names)}: {n}" for n, names in sorted(agents.items(), reverse=True))
+        found.append(f"{evidence.experiment.title}: runs on {len(rows)} of {of} data sets ({counts}).")
+    return found
 
 
 def _section(name: str, evidence: Evidence, report: Report, link: str) -> list[str]:
@@ -80,7 +105,7 @@ def _section(name: str, evidence: Evidence, report: Report, link: str) -> list[s
         parts.append("Not run.")
     if report.verdicts:
         parts.append(verdict_table(report.verdicts).markdown())
-    if "long" in report.tables:
+    if "long" in report.tables and (report.has_figure or not experiment.panels):
         parts.append(f"Per agent and data, with seeds and intervals: [{name}-long.csv]({link}tables/{name}-long.csv).")
     return parts
 

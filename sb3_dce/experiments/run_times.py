@@ -52,7 +52,7 @@ def has_fewer_draws(evidence: Evidence, variant: Variant) -> bool:
     :param variant: agent
     :return: whether the scale makes each of its updates cheaper than the authors'
     """
-    return "n_mc_dropout" in evidence.scale.set_for.get(variant.algo, {})
+    return bool(evidence.scale.set_for.get(variant.algo, {}).keys() & {"n_mc_dropout", "n_ood_actions"})
 
 
 class RunTime(NamedTuple):
