@@ -106,7 +106,10 @@ def train(
 @app.command()
 def compare(
     dataset: Annotated[str, typer.Option(help="Id such as [b]walker2d-medium[/b], or a file.")],
-    algos: Annotated[str, typer.Option(help="Agents, separated by commas: dce,iql,cql, ...")] = "dce,offline_bc",
+    algos: Annotated[
+        str,
+        typer.Option(show_default=False, help="Agents, separated by commas: dce,iql,cql, ... Default dce,offline_bc."),
+    ] = "",
     updates: Annotated[float, typer.Option(min=1, help="Gradient steps of each run, e.g. 1e5.")] = 1e6,
     seeds: Annotated[int, typer.Option(min=1, help="Seeds of each agent.")] = 3,
     eval_freq: Annotated[int, typer.Option(min=1, help="Gradient steps between two evaluations and checkpoints.")] = 5000,
@@ -126,16 +129,24 @@ def compare(
     updates_of: Annotated[
         list[str] | None, typer.Option(metavar="AGENT=UPDATES", help="Gradient steps of one agent, e.g. pbrl=1e4; repeat it.")
     ] = None,
+    report_only: Annotated[
+        bool,
+        typer.Option("--report-only", help="Train nothing: table and curves of all complete runs there are, or of --algos."),
+    ] = False,
 ) -> None:
     """Train several agents on one dataset and compare their last policies. The same command goes on with the rest."""
     from sb3_dce.data import find_file
 
     find_file(dataset)  # a missing file is said before PyTorch is imported
-    from sb3_dce.compare import compare as run_comparison
+    from sb3_dce import compare as comparison
 
     names = list(_names(algos))
+    if report_only:
+        comparison.report(dataset, names, out, console)
+        return
+    names = names or ["dce", "offline_bc"]
     n_workers = workers or usable_cores()
-    run_comparison(
+    comparison.compare(
         *(dataset, names, check_steps("--updates", updates), range(seeds), eval_freq, eval_episodes, n_workers, out, console),
         overrides=_parse_overrides(set_ or []),
         updates_of=_parse_lengths(updates_of or []),

@@ -19,6 +19,7 @@ from sb3_dce.agents import agent_class
 from sb3_dce.checks import check_ends_with_evaluation
 from sb3_dce.data import find_file, load_transitions
 from sb3_dce.data.catalog import DatasetSpec, normalized_score
+from sb3_dce.data.hashes import sha256_once
 from sb3_dce.data.locate import short_name
 from sb3_dce.errors import ConfigError, DivergenceError
 from sb3_dce.evaluation import read_evaluations
@@ -26,7 +27,7 @@ from sb3_dce.files import write_text
 from sb3_dce.hyperparams import check_keys, full_name
 from sb3_dce.launch import launch_all, raise_first
 from sb3_dce.plots import plot_learning_curves
-from sb3_dce.run_files import RunSpec, last_metrics, read_divergence, read_result
+from sb3_dce.run_files import RunSpec, last_metrics, read_config, read_divergence, read_result
 from sb3_dce.runs import check_before_running
 from sb3_dce.student import sample_std
 
@@ -104,9 +105,8 @@ def compare(
         )
     settings = settings_of(algos, overrides or {})
     lengths = _lengths(algos, n_updates, updates_of or {}, eval_freq)
-    path, spec = find_file(dataset)
-    name = short_name(dataset)
-    folder = out or Path("runs") / f"compare-{name}"
+    path, _ = find_file(dataset)
+    name, folder = short_name(dataset), out or default_folder(dataset)
     console.print(
         f"[b]{', '.join(algos)}[/b] on [b]{name}[/b] ({path}), {n_updates:,} gradient steps, seeds {list(seeds)}, last policy"
     )
@@ -120,13 +120,62 @@ def compare(
     ]
     check_before_running(specs)
     outcomes = launch_all(specs, workers, console)
-    info = load_transitions(dataset).info
-    level = float(info.episode_returns.mean()) if len(info.episode_returns) else None
     # What diverges is a result. Other errors are said below the table of what is complete.
     errors = [o for o in outcomes if isinstance(o, BaseException) and not isinstance(o, DivergenceError)]
-    rows = summarize(folder, specs, spec, level, console) if len(errors) < len(specs) else []
+    rows = _summarize(dataset, folder, specs, console) if len(errors) < len(specs) else []
     raise_first(errors, console)
     return rows
+
+
+def default_folder(dataset: str) -> Path:
+    """
+    :param dataset: id or file
+    :return: folder of its comparison
+    """
+    return Path("runs") / f"compare-{short_name(dataset)}"
+
+
+def report(dataset: str, algos: Sequence[str], out: Path | None, console: Console) -> list[Row]:
+    """
+    Show and write the comparison of all complete runs there are, as they were run; nothing is trained.
+
+    :param dataset: id or file
+    :param algos: names of agents; empty for all in the folder
+    :param out: folder of the results, default ``runs/compare-<dataset>``
+    :param console: where to print
+    :return: the table
+    :raises ConfigError: without a complete run, or if one was trained on another file
+    """
+    folder, wanted = out or default_folder(dataset), {full_name(algo) for algo in algos}
+    runs: dict[str, dict[str, list[RunSpec]]] = {}
+    for path in sorted(folder.glob("*/seed_*"), key=lambda path: (path.parent.name, len(path.name), path.name)):
+        config = read_config(path)
+        if config is None or (wanted and config["run"]["algo"] not in wanted):
+            continue
+        spec = RunSpec(**config["run"], folder=str(path))
+        if read_result(path) is None and read_divergence(path) is None:
+            continue
+        if config["dataset"]["sha256"] != sha256_once(find_file(dataset)[0]):
+            what = f"trained on another file ({config['dataset']['name']}) than {dataset}"
+            raise ConfigError(what, where=str(path), hint="Name that one, or another folder with --out.")
+        how = f"{spec.n_updates:,} updates{''.join(f', {k}={v}' for k, v in sorted(spec.overrides.items()))}"
+        runs.setdefault(spec.algo, {}).setdefault(how, []).append(spec)
+    chosen = []
+    for algo, kinds in runs.items():
+        shown = max(kinds.values(), key=len)
+        chosen += shown
+        for how, others in kinds.items():
+            if others is not shown:
+                console.print(f"left out: {len(others)} of {algo} with {how}", markup=False)
+    if not chosen:
+        raise ConfigError("no complete run", where=str(folder), hint="Run the comparison first, without --report-only.")
+    return _summarize(dataset, folder, chosen, console)
+
+
+def _summarize(dataset: str, folder: Path, specs: Sequence[RunSpec], console: Console) -> list[Row]:
+    info = load_transitions(dataset).info
+    level = float(info.episode_returns.mean()) if len(info.episode_returns) else None
+    return summarize(folder, specs, find_file(dataset)[1], level, console)
 
 
 def settings_of(algos: Sequence[str], overrides: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

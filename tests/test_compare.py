@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from commands import sb3_dce
 from rich.console import Console
 
-from sb3_dce.compare import compare, settings_of, summarize
+from sb3_dce.compare import compare, report, settings_of, summarize
 from sb3_dce.data import Transitions, resolve
 from sb3_dce.data.catalog import normalized_score
 from sb3_dce.errors import CheckpointError, ConfigError
@@ -47,6 +48,33 @@ def test_comparison_trains_writes_and_goes_on(tmp_path: Path) -> None:
     again = compare(*arguments, quiet)  # nothing is trained again
     assert [row[:4] for row in again] == [row[:4] for row in rows]
     assert (tmp_path / "offline_bc" / "seed_0" / "model.zip").stat().st_mtime_ns == stamp
+
+
+def test_report_is_made_of_all_complete_runs_and_trains_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    quiet = Console(quiet=True)
+    compare(TINY, ["bc"], 4, range(2), 2, 1, 2, tmp_path, quiet)
+    compare(TINY, ["sac_v"], 2, range(1), 2, 1, 2, tmp_path, quiet, overrides={"batch_size": 16})
+    assert "offline_bc" not in (tmp_path / "comparison.md").read_text()
+    other = tmp_path / "offline_bc" / "seed_2"
+    shutil.copytree(tmp_path / "offline_bc" / "seed_1", other)
+    config = yaml.safe_load((other / "config.yml").read_text())
+    config["run"] |= {"seed": 2, "overrides": {"batch_size": 8}}
+    (other / "config.yml").write_text(yaml.safe_dump(config))
+    (tmp_path / "offline_bc" / "seed_3").mkdir()
+    stamps = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/*/*")}
+    outcome = sb3_dce("compare", "--dataset", TINY, "--report-only", "--out", str(tmp_path))
+    assert outcome.code == 0, outcome.stderr
+    assert "left out: 1 of offline_bc with 4 updates, batch_size=8" in outcome.stdout
+    rows = {row.agent: row for row in report(TINY, [], tmp_path, quiet)}
+    assert {name: (row.n_seeds, row.n_updates) for name, row in rows.items()} == {"offline_bc": (2, 4), "sac_v": (1, 2)}
+    assert [row.agent for row in report(TINY, ["bc"], tmp_path, quiet)] == ["offline_bc"]
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/*/*")} == stamps
+    config["dataset"]["sha256"] = "0" * 64
+    (other / "config.yml").write_text(yaml.safe_dump(config))
+    with pytest.raises(ConfigError, match="trained on another file"):
+        report(TINY, [], tmp_path, quiet)
+    with pytest.raises(ConfigError, match="no complete run"):
+        report(TINY, [], tmp_path / "nothing", quiet)
 
 
 def test_single_agents_have_their_own_settings_and_length(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
