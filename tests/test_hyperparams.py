@@ -12,6 +12,7 @@ import pytest
 
 from sb3_dce import hyperparams
 from sb3_dce.agents import AGENTS
+from sb3_dce.configuration import defaults_of
 from sb3_dce.data import catalog
 from sb3_dce.errors import ConfigError, DatasetError
 from sb3_dce.schedules import StepSchedule
@@ -110,6 +111,47 @@ def test_dce_row_has_the_papers_values(paper: dict[str, str]) -> None:
     common = {"learning_rate": 3e-4, "gamma": 0.99, "tau": 0.005, "expectile": 0.7, "td_loss_coef": 1.0, "batch_size": 256}
     assert {key: row[key] for key in common} == common
     assert row["policy_kwargs"] == {"net_arch": [256, 256]}
+
+
+THREE_LAYERS, TWO_LAYERS = {"net_arch": [256, 256, 256]}, {"net_arch": [256, 256]}
+# Of the baselines' rows what is not the class's default, by family, as their authors have it (docs/agents.md).
+CQL_ANTMAZE = {"cql_weight": 5.0, "lagrange_threshold": 5.0, "reward_scale": 4.0, "reward_shift": -2.0}
+IQL_ANTMAZE = {"expectile": 0.9, "temperature": 10.0, "reward_shift": -1.0}
+EXCEPTIONS: dict[str, dict[str, dict[str, Any]]] = {
+    "offline_cql": {"adroit": {"cql_weight": 1.0}, "kitchen": {"cql_weight": 1.0}, "antmaze": CQL_ANTMAZE},
+    "offline_iql": {
+        "gym": {"reward_normalization": "iql"},
+        **{family: {"temperature": 0.5, "actor_dropout": 0.1} for family in ("adroit", "kitchen")},
+        "antmaze": IQL_ANTMAZE,
+    },
+}
+LOW = {"uncertainty_coef": 0.0001}
+
+
+def expected_of_pbrl(name: str) -> dict[str, Any]:
+    if "-expert-v1" in name:
+        weight = 0.2 if name.startswith("door") else 0.4
+        next_weight = {"ood_weight_next": 0.2} if name.startswith("relocate") else {}
+        return {"ood_weight": weight, "ood_weight_final": None, **next_weight, **LOW}
+    if name == "default" or "-medium-expert-" in name:
+        return {}
+    if "-expert-" in name:
+        return {"ood_weight": 2.0, "ood_weight_final": None}
+    if name.startswith(("halfcheetah", "hopper", "walker2d")):
+        return {"adaptive_ood_weight": True}
+    weight = 0.001 if name == "pen-human-v0" else 0.01
+    return {"ood_weight": weight, "ood_weight_next": weight, "ood_weight_final": None, **LOW}
+
+
+@pytest.mark.parametrize("algo", [algo for algo in AGENTS if algo != "dce"])
+def test_rows_of_the_baselines_are_the_authors_values(algo: str) -> None:
+    defaults = defaults_of(algo)
+    layers = THREE_LAYERS if algo in ("offline_cql", "offline_pbrl") else TWO_LAYERS
+    for name, row in hyperparams.read_rows(algo).items():
+        family = "" if name == "default" else catalog.resolve(name).family
+        special = expected_of_pbrl(name) if algo == "offline_pbrl" else EXCEPTIONS.get(algo, {}).get(family, {})
+        kwargs = {key: v for key, v in hyperparams.split_row(row).kwargs.items() if key not in ("dataset", "policy")}
+        assert {key: v for key, v in kwargs.items() if defaults[key] != v} == {"policy_kwargs": layers, **special}, name
 
 
 @pytest.mark.parametrize("dataset", BETAS)

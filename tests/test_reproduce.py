@@ -29,7 +29,7 @@ from sb3_dce.dce_probe import PROBE_BETAS, OfflineDCEProbe
 from sb3_dce.errors import ConfigError, DivergenceError
 from sb3_dce.experiments import results
 from sb3_dce.experiments import run as experiment_run
-from sb3_dce.experiments.grid import PlannedRun, Scale, expand, load_experiment
+from sb3_dce.experiments.grid import PlannedRun, Scale, expand, experiment_ids, load_experiment
 from sb3_dce.experiments.probe import prepare_probe
 from sb3_dce.experiments.reproduce import Request, plan_runs, reproduce, scale_of
 from sb3_dce.experiments.run import execute, is_complete, population_file, populations
@@ -359,6 +359,50 @@ def test_kitchen_row_is_run_where_its_file_is_and_no_data_elsewhere(tmp_path: Pa
     assert cells["kitchen-complete-v0"][table.header.index("paper: IQL")] == "**62.5**"
     assert {"kitchen-partial-v0: no data", "kitchen-mixed-v0: no data"} <= set(cells)
     assert "`kitchen-complete-v0` (D4RL; sha256" in table.caption
+
+
+def test_command_trains_the_policy_that_the_probe_needs_and_then_the_probe(tmp_path: Path) -> None:
+    outcome = sb3_dce("reproduce", "fig-ood", "--updates", "20", "--out", str(tmp_path), "--workers", "1")
+    assert outcome.code == 0, outcome.stderr
+    rows = results.read_folder(tmp_path / "rows")
+    assert set(rows["agent"]) == {"dce", "dce_probe"}
+    assert {f"probe{beta}_{kind}" for beta in (0, *PROBE_BETAS) for kind in ("data", "policy", "max")} <= set(rows["metric"])
+    assert (tmp_path / "figures" / "fig-ood.png").stat().st_size > 10_000
+    made = models(tmp_path)
+    again = sb3_dce("reproduce", "fig-ood", "--updates", "20", "--out", str(tmp_path), "--workers", "1")
+    assert again.code == 0 and models(tmp_path) == made, "nothing is trained again"
+
+
+def test_cluster_takes_no_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_dce.experiments.reproduce.check_device", lambda device: None)  # as on a machine that has one
+    request = Request(("fig-sac",), "smoke", tmp_path, device="cuda", ray_address="auto")
+    with pytest.raises(ConfigError, match=r"--ray-address and --device cuda do not go together\. A cluster"):
+        reproduce(request, QUIET)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [n for n in experiment_ids() if n not in ("bounds", "config-tables")])
+def test_every_experiment_runs_at_smoke_scale(name: str, tmp_path: Path) -> None:
+    outcome = sb3_dce("reproduce", name, "--out", str(tmp_path), "--workers", "2")
+    assert outcome.code == 0, outcome.stderr
+    assert len(keys_of(results.read_folder(tmp_path / "rows"))) > 0 and "Traceback" not in outcome.stdout
+
+
+@pytest.mark.slow
+def test_results_page_is_what_its_rows_give(tmp_path: Path) -> None:
+    """It may have been forgotten after a change of rows or rules."""
+    folder = Path(__file__).parents[1] / "docs"
+    shutil.copytree(folder / "results" / "rows", tmp_path / "docs" / "results" / "rows")
+    made = tmp_path / "docs" / "results.md"
+    where = ("--out", str(tmp_path / "docs" / "results"), "--page", str(made))
+    outcome = sb3_dce("reproduce", "all", "--scale", "cpu", "--report-only", *where)
+    assert outcome.code == 0, outcome.stderr
+
+    def told(path: Path) -> list[str]:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        return [line for line in lines if not line.startswith("Made from the result rows")]  # it names the folders
+
+    assert told(made) == told(folder / "results.md")
 
 
 # -- kills and other machines --------------------------------------------------------------------------------------

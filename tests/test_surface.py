@@ -36,6 +36,9 @@ from sb3_dce.errors import ConfigError, DatasetError, DatasetIntegrityError, Dat
 from sb3_dce.evaluation import EvaluationCallback, evaluate
 from sb3_dce.population import Population
 from sb3_dce.rollouts import make_rollouts, rollouts_of
+from sb3_dce.run_files import RunSpec
+from sb3_dce.runs import run
+from sb3_dce.training import load_any
 
 TINY = "halfcheetah-tiny-sb3"
 
@@ -279,6 +282,19 @@ def test_an_environment_can_be_named_for_an_evaluation(tmp_path: Path) -> None:
     assert "no environment" in sb3_dce("evaluate", model, "--env", "Nowhere-v0").stderr.replace("cannot make the", "no")
     both = sb3_dce("evaluate", model, "--env", "HalfCheetah-v4", "--dataset", TINY)
     assert both.code == 2 and "both name an environment" in both.stderr
+
+
+@pytest.mark.parametrize("algo", agents.AGENTS)
+def test_every_agent_goes_through_load_dataset_and_a_run_that_is_loaded(algo: str, tmp_path: Path) -> None:
+    few = {"offline_uwac": {"n_mc_dropout": 2, "n_target_actions": 2}, "offline_pbrl": {"n_ood_actions": 1}}
+    settings = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "execution": "eager", **few.get(algo, {})}
+    result = run(RunSpec(algo, TINY, 0, 2, str(tmp_path), 2, 1, settings))
+    assert result["n_updates"] == 2 and np.isfinite(result["normalized_score"])
+    cls, model = agents.agent_class(algo), load_any(tmp_path / "model.zip")
+    assert type(model) is cls and model.num_timesteps == 2
+    actions = model.predict(np.zeros((3, 17), dtype=np.float32), deterministic=True)[0]
+    assert actions.shape == (3, 6) and (np.abs(actions) <= 1.0).all()
+    assert cls.load_dataset(TINY, policy_kwargs={"net_arch": [8]}).dataset == TINY
 
 
 def test_recorded_files_say_where_they_are_evaluated(tmp_path: Path) -> None:

@@ -159,6 +159,9 @@ def _check_request(request: Request) -> None:
     check_choice("--device", request.device, DEVICES)
     check_choice("--precision", request.precision, PRECISIONS)
     check_device(request.device)
+    if request.ray_address is not None and request.device.startswith("cuda"):
+        hint = "A cluster trains each run on one core. Leave --device out, or run on the GPU's machine without --ray-address."
+        raise ConfigError("--ray-address and --device cuda do not go together", key="--device", hint=hint)
     lacking = missing_for(request.precision, get_device(request.device))
     if lacking is not None and request.ray_address is None and not request.report_only:
         hint = "Leave it out: float32 runs everywhere."
