@@ -24,7 +24,7 @@ from sb3_dce.buffers import OfflineReplayBuffer
 from sb3_dce.data import Transitions, find_file, load_dataset, load_transitions
 from sb3_dce.data.catalog import DatasetSpec, resolve
 from sb3_dce.data.loading import DatasetLike as DatasetLike
-from sb3_dce.data.locate import is_path
+from sb3_dce.data.locate import is_path, known_dataset
 from sb3_dce.data.minari import is_minari_name
 from sb3_dce.envs import SpacesEnv, dataset_spaces, make_env_if_possible, own_env
 from sb3_dce.errors import (
@@ -173,8 +173,9 @@ class AttachingMixin(OffPolicyAlgorithm):
         super().load_replay_buffer(path, truncate_last_traj)
         if not isinstance(self.replay_buffer, OfflineReplayBuffer):
             self.set_dataset(Transitions.from_replay_buffer(self.replay_buffer))
-        elif (known := self.dataset_statistics) is not None and known.get("sample_hash") != self.replay_buffer.sample_hash():
-            self.forget_rows()
+        elif self.dataset_statistics is not None and self.replay_buffer.size() > 0:
+            if self.dataset_statistics.get("sample_hash") != self.replay_buffer.sample_hash():
+                self.forget_rows()
 
     def _own_buffer(self) -> OfflineReplayBuffer:
         if not isinstance(self.replay_buffer, OfflineReplayBuffer):
@@ -416,8 +417,8 @@ def as_dataset(source: DatasetLike) -> str | os.PathLike[str] | Transitions:
 
 def _spec_of(transitions: Transitions) -> DatasetSpec | None:
     """The entry of the file that they were read from, if their actions have the bounds of its environment."""
-    spec = None if transitions.info.path is None else find_file(transitions.info.path)[1]
-    if spec is None:
+    spec = None if transitions.info.path is None else known_dataset(transitions.info.path)  # the file may have gone since
+    if spec is None or transitions.obs_shape != (spec.obs_dim,):
         return None
     bounds, own = dataset_spaces(spec)[1], (transitions.info.action_space_low, transitions.info.action_space_high)
     same = all(np.array_equal(a, b) for a, b in zip((bounds.low, bounds.high), own, strict=True))

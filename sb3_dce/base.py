@@ -465,11 +465,12 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         )
         self._check_frequencies(callback, log_interval)
         callback.on_training_start(locals(), globals())
-        keep_going = True
+        keep_going, begin = True, self.num_timesteps
         while keep_going and self.num_timesteps < total_timesteps:
-            # up to the next multiple, where callbacks are due: a run may begin or have been interrupted between two
-            chunk = self.gradient_steps - self.num_timesteps % self.gradient_steps
-            chunk = min(chunk, total_timesteps - self.num_timesteps)
+            # Up to where a callback may be due: some count timesteps, Stable-Baselines3's the calls of this ``learn()``, which
+            # may begin between two multiples.
+            done, g = self.num_timesteps, self.gradient_steps
+            chunk = min(g - done % g, g - (done - begin) % g, total_timesteps - done)
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
             timesteps, updates = self.num_timesteps, self._n_updates
             try:

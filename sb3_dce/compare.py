@@ -152,9 +152,11 @@ def report(dataset: str, algos: Sequence[str], out: Path | None, console: Consol
         config = read_config(path)
         if config is None or (wanted and config["run"]["algo"] not in wanted):
             continue
-        spec = RunSpec(**config["run"], folder=str(path))
-        if read_result(path) is None and read_divergence(path) is None:
+        result = read_result(path)
+        if result is None and read_divergence(path) is None:
             continue
+        # a complete run may be on its way to become a longer one
+        spec = RunSpec(**(config["run"] if result is None else result["config"]), folder=str(path))
         if config["dataset"]["sha256"] != sha256_once(find_file(dataset)[0]):
             what = f"trained on another file ({config['dataset']['name']}) than {dataset}"
             raise ConfigError(what, where=str(path), hint="Name that one, or another folder with --out.")

@@ -310,12 +310,20 @@ class BatchedRuns:
         return results
 
 
-def members_of(state_file: Path) -> list[str]:
+def members_to_go_on(state_file: Path) -> list[Path]:
     """
     :param state_file: of a population that was interrupted
-    :return: names of its members' folders, in its order
+    :return: its members' folders, in its order; none if it cannot go on: the file is damaged, or a checkpoint has gone since,
+        as when some of its runs were begun anew
     """
-    return list(th.load(state_file, weights_only=True).get("members", ()))
+    try:
+        state = th.load(state_file, weights_only=True)
+        folders = [state_file.parent / name for name in state.get("members", ())]
+        n_updates, diverged = state["n_updates"], state.get("diverged", {})
+    except Exception:
+        return []
+    whole = all(i in diverged or (folder / _checkpoint(n_updates)).is_file() for i, folder in enumerate(folders))
+    return folders if whole else []
 
 
 def _checkpoint(n_updates: int) -> str:

@@ -90,7 +90,7 @@ class SavingMixin(OffPolicyAlgorithm):
     def load(
         cls: type[SelfSaving],
         path: str | pathlib.Path | io.BufferedIOBase,
-        env: GymEnv | None = None,
+        env: GymEnv | str | None = None,
         device: th.device | str = "auto",
         custom_objects: dict[str, Any] | None = None,
         print_system_info: bool = False,
@@ -101,7 +101,7 @@ class SavingMixin(OffPolicyAlgorithm):
         Load a model. No dataset is read and no replay buffer allocated; ``learn()`` attaches the data again.
 
         :param path: zip file
-        :param env: environment for evaluation; may be ``None``
+        :param env: environment for evaluation, or the id of one; may be ``None``
         :param device: device of the networks
         :param custom_objects: replacements of saved attributes
         :param print_system_info: print versions of this machine and of the file
@@ -135,7 +135,7 @@ class SavingMixin(OffPolicyAlgorithm):
             what = f"the model cannot be read: {text.splitlines()[0][:200]}"
             raise CheckpointError(what, where=_name_of(source), hint=hint) from error
         if env is not None:
-            model.set_env(env, force_reset)
+            model.set_env(env, force_reset)  # type: ignore[arg-type]  # AttachingMixin takes an id
         if not isinstance(model.dataset, str | None):
             raise CheckpointError(f"its dataset is {model.dataset!r}", where=_name_of(source), hint=DAMAGED)
         _refuse_not_finite(model, CheckpointError, f"{_name_of(source)} cannot be used")

@@ -75,7 +75,8 @@ def test_callbacks_see_what_they_count_after_a_length_that_is_no_multiple(transi
     model.learn(7, log_interval=None)
     model.learn(13, recorder, reset_num_timesteps=False, log_interval=None)
     counted = dict(recorder.seen)
-    assert (counted[10], counted[15], counted[20]) == (10, 15, 20)
+    assert (counted[10], counted[15], counted[20]) == (10, 15, 20), "callbacks that count timesteps"
+    assert recorder.seen[4] == (12, 12) and recorder.seen[9] == (17, 17), "and those that count calls"
 
 
 def test_model_goes_on_after_a_callback_that_fails_in_the_middle(transitions: Transitions) -> None:

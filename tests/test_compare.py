@@ -60,6 +60,8 @@ def test_report_is_made_of_all_complete_runs_and_trains_nothing(tmp_path: Path, 
     config = yaml.safe_load((other / "config.yml").read_text())
     config["run"] |= {"seed": 2, "overrides": {"batch_size": 8}}
     (other / "config.yml").write_text(yaml.safe_dump(config))
+    result = json.loads((other / "result.json").read_text())
+    (other / "result.json").write_text(json.dumps({**result, "config": config["run"]}))
     (tmp_path / "offline_bc" / "seed_3").mkdir()
     stamps = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/*/*")}
     outcome = sb3_dce("compare", "--dataset", TINY, "--report-only", "--out", str(tmp_path))
@@ -69,6 +71,11 @@ def test_report_is_made_of_all_complete_runs_and_trains_nothing(tmp_path: Path, 
     assert {name: (row.n_seeds, row.n_updates) for name, row in rows.items()} == {"offline_bc": (2, 4), "sac_v": (1, 2)}
     assert [row.agent for row in report(TINY, ["bc"], tmp_path, quiet)] == ["offline_bc"]
     assert {path: path.stat().st_mtime_ns for path in tmp_path.glob("*/*/*")} == stamps
+    longer = tmp_path / "offline_bc" / "seed_0" / "config.yml"  # on its way to become a longer run
+    begun = yaml.safe_load(longer.read_text())
+    begun["run"]["n_updates"] = 8
+    longer.write_text(yaml.safe_dump(begun))
+    assert [(row.n_seeds, row.n_updates) for row in report(TINY, ["bc"], tmp_path, quiet)] == [(2, 4)]
     config["dataset"]["sha256"] = "0" * 64
     (other / "config.yml").write_text(yaml.safe_dump(config))
     with pytest.raises(ConfigError, match="trained on another file"):

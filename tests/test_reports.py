@@ -16,6 +16,7 @@ from sb3_dce.experiments.curves import panel_curves
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import experiment_ids, load_experiment, variant_hash
 from sb3_dce.experiments.judging import HELD, NOT_HELD, UNTESTED, Verdict
+from sb3_dce.experiments.pages import coverage
 from sb3_dce.experiments.reports import config_table, make_report, toy_table
 from sb3_dce.experiments.run_times import runtime_table
 from sb3_dce.experiments.tables import aggregate_tables, common_rows, score_table
@@ -518,6 +519,23 @@ def test_runs_of_a_schedule_that_parts_later_are_those_of_the_constant() -> None
     evidence = evidence_of(rows, "fig-alpha")
     assert evidence.tail(alpha.variant("beta 4"), walker, "ent_coef") == 0.3, "its own runs count first"
     assert aggregate_tables(evidence_of(rows))["sb3"].rows[-1][0] == "DCE", "no agent stands there twice"
+
+
+def test_runs_are_borrowed_once_however_many_columns_they_stand_for() -> None:
+    why, hopper = load_experiment("why-dce-loses"), "hopper-medium-sb3"
+    rows = run_rows(why, "beta constant", hopper, 0, curves={"survival_margin": [1.0] * 4, "score": [30.0] * 4})
+    evidence = evidence_of(rows, "why-dce-loses")
+    assert why.variant("DCE").set != why.variant("temperature auto").set  # one agent under one hash on this set
+    for name in ("DCE", "temperature auto"):
+        assert evidence.last(why.variant(name), hopper).tolist() == [30.0]
+        assert len(evidence.curve(why.variant(name), hopper, "survival_margin")) == 4
+    assert make_report(evidence).tables["changes"].rows
+
+
+def test_coverage_counts_data_sets_and_not_files() -> None:
+    both = {"walker2d-medium-v2": {"DCE": [1.0]}, "walker2d-medium-sb3": {"DCE": [1.0], "BC": [1.0]}}
+    (text,) = coverage({"table1": evidence_of(table_rows(TABLE, both))})
+    assert text.startswith("Gym locomotion, all agents: runs on 1 of 12 data sets (BC, DCE: 1; ")
 
 
 def test_what_is_no_cause_of_a_loss_is_said_too() -> None:

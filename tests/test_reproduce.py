@@ -266,6 +266,26 @@ def test_population_killed_while_it_writes_its_results_only_writes_the_rest(
     assert not list((tmp_path / "runs").glob("*.pt")) and not list((tmp_path / "runs").glob("*/checkpoint*"))
 
 
+def test_population_whose_checkpoints_have_gone_is_none_to_go_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trained: list[int] = []
+
+    def on_the_cpu(group: list[RunSpec], device: th.device, console: Console) -> None:
+        trained.append(len(group))
+        BatchedRuns(group, th.device("cpu"), "eager", QUIET, state_file=population_file(group)).run()
+
+    monkeypatch.setattr(experiment_run, "_train_group", on_the_cpu)
+    monkeypatch.setattr(experiment_run, "get_device", th.device)
+    plan = [r for r in small_plan("fig-beta", tmp_path, updates=4) if r.spec.algo == "dce"]
+    with monkeypatch.context() as patch:
+        patch.setattr(BatchedRuns, "_finish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            train(plan, device="cuda")
+    train(plan[:4], device="cuda")  # a smaller plan begins these anew, and deletes their checkpoints
+    (tmp_path / "runs" / "population-damaged.pt").write_bytes(b"no state")
+    train(plan, device="cuda")
+    assert trained == [7, 4, 3] and all(is_complete(r.spec) for r in plan)
+
+
 def test_population_of_a_figure_writes_what_its_processes_would_write(tmp_path: Path) -> None:
     plan = small_plan("fig-beta", tmp_path, updates=4)
     group = max(populations(r.spec for r in plan), key=len)

@@ -75,6 +75,14 @@ def test_data_that_were_read_before_bring_row_and_environment(tmp_path: Path, mo
     assert rows[0] == rows[1] != rows[2]
     environments = [type(model.get_env().envs[0].unwrapped) for model in (by_name, by_data, default)]
     assert environments[0] is environments[1] is not environments[2]
+    # a file that has gone since, or a reader that was not told, is no obstacle
+    read = load_dataset("hopper-medium-expert-sb3")
+    (tmp_path / "hopper-medium-expert-sb3.hdf5").rename(tmp_path / "moved.hdf5")
+    assert OfflineDCE.load_dataset(read, device="cpu").beta == by_name.beta
+    (tmp_path / "moved.hdf5").rename(tmp_path / "hopper-medium-expert-sb3.hdf5")
+    load_dataset(arrays()).to_hdf5(tmp_path / "hopper-medium-sb3.hdf5")
+    other = Transitions.from_hdf5(tmp_path / "hopper-medium-sb3.hdf5")
+    assert OfflineDCE.load_dataset(other, device="cpu", **SMALL).learn(1).observation_space.shape == (3,)
     # with other bounds of the actions it is another task
     wide = load_dataset("hopper-medium-expert-sb3", action_scale=2.0)
     assert {**OfflineDCE.load_dataset(wide, device="cpu").hyperparameters(), "dataset": None} == rows[2]
@@ -141,6 +149,18 @@ def test_buffer_with_other_rows_is_noticed(tmp_path: Path) -> None:
         fresh.learn(1)
     fresh.save(tmp_path / "fresh.zip")
     OfflineDCE.load(tmp_path / "fresh.zip").learn(1)
+
+
+def test_empty_buffer_changes_nothing(tmp_path: Path) -> None:
+    load_dataset(arrays()).to_hdf5(tmp_path / "data.hdf5")
+    trained = OfflineDCE.load_dataset(tmp_path / "data.hdf5", **SMALL).learn(1)
+    model = OfflineDCE("MlpPolicy", trained.get_env(), **SMALL)
+    model.save_replay_buffer(tmp_path / "empty.pkl")
+    trained.load_replay_buffer(tmp_path / "empty.pkl")
+    assert trained.learn(1).replay_buffer.size() == 57
+    model.load_replay_buffer(tmp_path / "empty.pkl")
+    with pytest.raises(ConfigError, match="nothing to learn from"):
+        model.learn(1)
 
 
 def test_buffer_of_data_in_memory_is_saved_before_the_first_update(tmp_path: Path) -> None:

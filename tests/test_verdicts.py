@@ -284,8 +284,8 @@ def test_borrowed_deviation_is_no_second_estimate() -> None:
 
     # two single runs, both with 4.2 and its four degrees of freedom: 2.776 * 4.2 * sqrt(2)
     assert [judged(x, 40.0) for x in (16.4, 16.6)] == [CLOSE, HELD]
-    # a single run with the deviation of three others, 5, and their two degrees of freedom: 4.303 * 5 * sqrt(1 + 1 / 3)
-    assert [judged(x, 35.0, 40.0, 45.0) for x in (24.7, 24.9)] == [CLOSE, HELD]
+    # a single run with the deviation of three others, 5, counts four too, and no more with theirs: 2.776 * 5 * sqrt(1 + 1 / 3)
+    assert [judged(x, 35.0, 40.0, 45.0) for x in (15.9, 16.2)] == [CLOSE, HELD]
 
 
 def test_single_runs_spread_on_each_data_set_as_the_papers_dce() -> None:

@@ -146,9 +146,9 @@ class Evidence:
         """All runs of the experiment's variants on one file, of one length."""
         if dataset_id in self._selected:
             return self._selected[dataset_id]
-        keys = {(dataset_id, v.algo, variant_hash(v, dataset_id, self.scale)) for v in self.experiment.variants}
+        keys = {(dataset_id, v.algo, variant_hash(v, dataset_id, self.scale)): v for v in self.experiment.variants}
         parts = [self._groups[key] for key in sorted(keys) if key in self._groups]
-        again = [part for v in self.experiment.variants for part in self._of_the_same_agent(v, dataset_id)]
+        again = [part for variant in keys.values() for part in self._of_the_same_agent(variant, dataset_id)]
         found = pd.concat([*parts, *again]) if parts or again else self._rows.iloc[:0]
         runs, once = (
             rows[["dataset_sha256", "agent", "config_hash", "n_updates", "seed"]].drop_duplicates()

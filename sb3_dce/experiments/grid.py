@@ -319,7 +319,8 @@ def agent_key(algo: str, settings: Mapping[str, Any], n_updates: int) -> str:
     if not settings.keys() >= set(_SCHEDULE):
         return config_hash(algo, dict(settings))
     others = {key: value for key, value in settings.items() if key not in _SCHEDULE}
-    return f"{config_hash(algo, others)} {StepSchedule.of(settings).changes(n_updates)}"
+    changes = [(at, float(by)) for at, by in StepSchedule.of(settings).changes(n_updates)]  # 8 and 8.0 are one number
+    return f"{config_hash(algo, others)} {changes}"
 
 
 def source_of(dataset_id: str) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import Variant
-from sb3_dce.experiments.paper import PAPER_SEEDS, paper_score
+from sb3_dce.experiments.paper import paper_score
 from sb3_dce.experiments.statistics import sample_std
 from sb3_dce.student import student_quantile, welch_freedom
 
@@ -142,14 +142,12 @@ def uncertainty(evidence: Evidence, variant: Variant, dataset_id: str) -> Uncert
     n = max(1, len(evidence.last(variant, dataset_id)))
     if n >= FEWEST_OWN:
         return Uncertainty(sample_std(evidence.last(variant, dataset_id)) / math.sqrt(n), n - 1)
-    known = [(SEED_STD, SEED_STD_FREEDOM)]
     papers = {evidence.paper_id(dataset) for dataset, name in evidence.table_rows() if name == dataset_id}
     cells = [paper_score(paper, "DCE") for paper in papers]
-    known += [(cell.std, PAPER_SEEDS - 1) for cell in cells if cell is not None and cell.std is not None]
+    known = [cell.std for cell in cells if cell is not None and cell.std is not None]
     others = [evidence.last(v, dataset_id) for v in evidence.experiment.variants]
-    known += [(sample_std(scores), len(scores) - 1) for scores in others if len(scores) > 1]
-    std, freedom = max(known)
-    return Uncertainty(std / math.sqrt(n), freedom, borrowed=True)
+    known += [sample_std(scores) for scores in others if len(scores) > 1]
+    return Uncertainty(max([SEED_STD, *known]) / math.sqrt(n), SEED_STD_FREEDOM, borrowed=True)
 
 
 def above(values: Values | None, first: str, second: str) -> bool | str | None:

@@ -74,18 +74,20 @@ def coverage(evidences: Mapping[str, Evidence]) -> list[str]:
     """
     found = []
     for evidence in (e for e in evidences.values() if e.experiment.report == "table"):
-        rows = evidence.table_rows()
         agents: dict[int, list[str]] = {}
+        covered: set[str] = set()
         for variant in evidence.experiment.variants:
             if variant.paper is not None:
-                n = sum(
-                    len(evidence.runs(variant, name)) > 0 or evidence.of_other_length(variant, name).size > 0
-                    for _, name in rows
-                )
-                agents.setdefault(n, []).append(variant.name)
+                run_on = {
+                    dataset.paper
+                    for dataset, name in evidence.table_rows()
+                    if len(evidence.runs(variant, name)) or len(evidence.of_other_length(variant, name))
+                }
+                covered |= run_on
+                agents.setdefault(len(run_on), []).append(variant.name)
         of = len(evidence.experiment.datasets)
         counts = "; ".join(f"{', '.join(names)}: {n}" for n, names in sorted(agents.items(), reverse=True))
-        found.append(f"{evidence.experiment.title}: runs on {len(rows)} of {of} data sets ({counts}).")
+        found.append(f"{evidence.experiment.title}: runs on {len(covered)} of {of} data sets ({counts}).")
     return found
 
 

@@ -22,7 +22,7 @@ from sb3_dce.experiments.grid import PlannedRun
 from sb3_dce.experiments.probe import prepare_probe
 from sb3_dce.launch import launch_all
 from sb3_dce.population import free_parameters
-from sb3_dce.population_runs import members_of, train_population
+from sb3_dce.population_runs import members_to_go_on, train_population
 from sb3_dce.run_files import RunSpec, read_divergence, read_result
 
 # More members than this are trained one population after the other. The second table is for agents that evaluate
@@ -143,9 +143,10 @@ def begun_populations(specs: Sequence[RunSpec], planned: Sequence[RunSpec]) -> l
     groups = []
     for common in sorted({Path(folder).parent for folder in wanted}):
         for path in sorted(common.glob(STATE_FILES.format("*"))):
-            folders = [str(common / name) for name in members_of(path)]
+            folders = [str(folder) for folder in members_to_go_on(path)]
             if wanted.intersection(folders) and by_folder.keys() >= set(folders):
                 groups.append([by_folder[folder] for folder in folders])
+                wanted -= set(folders)
     return groups
 
 
