@@ -3,7 +3,8 @@ What the rows say about an experiment: scores of a table's cells, curves of a fi
 
 All cells of a table row come from one file: where rows of two versions of a dataset are known, those of the file that is here
 are taken, else of the one with more runs, and the others are counted as left out. All have one length; runs of an agent that
-has only others are shown as what they are (:meth:`Evidence.of_other_length`) and take part in no comparison.
+has only others are shown as what they are (:meth:`Evidence.of_other_length`) and take part in no comparison. A configuration
+without runs is shown with those of another that is the same agent over their length: two schedules of beta part later.
 """
 
 from __future__ import annotations
