@@ -131,7 +131,7 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]
-            python_number(learning_rate),
+            learning_rate,
             learning_starts=0,
             batch_size=batch_size,
             tau=tau,

@@ -235,22 +235,28 @@ def test_population_that_diverged_is_not_kept_while_others_are_trained(
     assert len(train(plan, device="cuda")) == len(alive) > 1
 
 
-def test_population_killed_while_it_writes_its_results_only_writes_the_rest(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    trained: list[int] = []
+@pytest.fixture
+def trained(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Sizes of the populations that are trained as on a GPU, but on the CPU."""
+    sizes: list[int] = []
 
     def on_the_cpu(group: list[RunSpec], device: th.device, console: Console) -> None:
-        trained.append(len(group))
+        sizes.append(len(group))
         BatchedRuns(group, th.device("cpu"), "eager", QUIET, state_file=population_file(group)).run()
 
+    monkeypatch.setattr(experiment_run, "_train_group", on_the_cpu)
+    monkeypatch.setattr(experiment_run, "get_device", th.device)
+    return sizes
+
+
+def test_population_killed_while_it_writes_its_results_only_writes_the_rest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trained: list[int]
+) -> None:
     def killed_at_the_third(spec: RunSpec, folder: Path, *rest: Any) -> dict[str, Any]:
         if len(list(folder.parent.glob("*/result.json"))) == 2:
             raise KeyboardInterrupt
         return write_result(spec, folder, *rest)
 
-    monkeypatch.setattr(experiment_run, "_train_group", on_the_cpu)
-    monkeypatch.setattr(experiment_run, "get_device", th.device)
     plan = [r for r in small_plan("fig-beta", tmp_path, updates=4) if r.spec.algo == "dce"]
     with monkeypatch.context() as patch:
         patch.setattr(population_runs, "write_result", killed_at_the_third)
@@ -266,15 +272,9 @@ def test_population_killed_while_it_writes_its_results_only_writes_the_rest(
     assert not list((tmp_path / "runs").glob("*.pt")) and not list((tmp_path / "runs").glob("*/checkpoint*"))
 
 
-def test_population_whose_checkpoints_have_gone_is_none_to_go_on_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    trained: list[int] = []
-
-    def on_the_cpu(group: list[RunSpec], device: th.device, console: Console) -> None:
-        trained.append(len(group))
-        BatchedRuns(group, th.device("cpu"), "eager", QUIET, state_file=population_file(group)).run()
-
-    monkeypatch.setattr(experiment_run, "_train_group", on_the_cpu)
-    monkeypatch.setattr(experiment_run, "get_device", th.device)
+def test_population_whose_checkpoints_have_gone_is_none_to_go_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trained: list[int]
+) -> None:
     plan = [r for r in small_plan("fig-beta", tmp_path, updates=4) if r.spec.algo == "dce"]
     with monkeypatch.context() as patch:
         patch.setattr(BatchedRuns, "_finish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
