@@ -24,8 +24,9 @@ from sb3_dce.attaching import DatasetLike
 from sb3_dce.buffers import OfflineReplayBuffer
 from sb3_dce.checks import check_choice, check_number, check_optional, check_seed, check_steps
 from sb3_dce.diagnostics import RECORDED, DiagnosticsMixin
+from sb3_dce.divergence import Rewind, locate, refuse
 from sb3_dce.envs import SpacesEnv
-from sb3_dce.errors import ConfigError
+from sb3_dce.errors import ConfigError, DivergenceError
 from sb3_dce.execution import EXECUTIONS, Engine, Update, choose_execution
 from sb3_dce.hyperparams import constructor_parameters
 from sb3_dce.networks import StandardizedExtractor
@@ -48,8 +49,9 @@ from sb3_dce.state import LearnedNumber, Storage, TrainState
 
 SelfOffline = TypeVar("SelfOffline", bound="OfflineAlgorithm")
 
-# Metrics are read back at least this often (updates), so that a divergence is noticed even without logging.
-GUARD_INTERVAL = 1000
+# Metrics are read back at least this often (updates), so that a divergence is noticed even without logging, and that as few
+# updates are made again to find where it began.
+GUARD_INTERVAL = 100
 
 
 class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
@@ -161,6 +163,7 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         self._coef: dict[str, th.Tensor] = {}
         self._coef_values: dict[str, float] = {}  # what the tensors hold
         self._warned_large_q = False
+        self._rewind = None
         self._new_run = True
         self._metrics_read_at = (time.time_ns(), 0)
         self.stats_window_size = stats_window_size
@@ -380,12 +383,13 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         rates = self.learning_rates()
         for name, storage in engine.state.storages.items():
             storage.set_learning_rate(rates.get(f"{name}_learning_rate", rates["learning_rate"]))
+        if self._rewind is None or self._rewind.engine is not engine:
+            self._rewind = Rewind.of(engine, generator, self._n_updates)
         assert buffer.rows is not None
         source = (buffer.rows.data_ptr(), buffer.size(), batch_size, self.precision, tuple(specs.items()))
 
         def draw() -> tuple[ReplayBufferSamples, dict[str, th.Tensor]]:
-            indices = th.randint(buffer.size(), (batch_size,), generator=generator, device=self.device)
-            batch = buffer.gather(indices, self._vec_normalize_env)
+            batch = buffer.gather(self.draw_rows(generator, batch_size), self._vec_normalize_env)
             if dtype != th.float32:
                 batch = batch._replace(**{k: v.to(dtype) for k, v in batch._asdict().items() if v is not None})
             return batch, {name: spec.draw(generator, self.device, dtype) for name, spec in specs.items()}
@@ -402,6 +406,23 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
                     self._n_updates += 1
                     if self.reads_state_after(self._n_updates):
                         self.read_state(engine.state.read())
+
+    def draw_rows(self, generator: th.Generator, batch_size: int) -> th.Tensor:
+        """
+        :param generator: what an update draws with; the rows come first
+        :param batch_size: rows per step
+        :return: row numbers of the buffer, shape (batch_size,)
+        """
+        return th.randint(self._own_buffer().size(), (batch_size,), generator=generator, device=self.device)
+
+    def divergence(self, names: list[str]) -> DivergenceError:
+        last = self._n_updates
+        error = refuse(names, self._metrics_read_at[1], last)
+        if self._rewind is not None:
+            error = locate(self, self._rewind) or error
+        self._rewind = None
+        self.num_timesteps += self._n_updates - last
+        return error
 
     def _bound_engine(self, planned_updates: int) -> Engine[TrainState]:
         """
@@ -496,6 +517,7 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
             self.set_env(SpacesEnv(self.observation_space, self.action_space))
         self._prepare_vec_normalize()
         self._metrics_read_at = (time.time_ns(), self._n_updates)
+        self._rewind = None
         self._new_run = True
         return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
 

@@ -317,8 +317,9 @@ def _cells(rows: list[Row], data_level: float | None, scored: bool) -> list[list
 
 def _show(lines: list[list[str]], console: Console) -> None:
     table = Table(box=None, header_style="bold")
-    for title in lines[0]:
-        table.add_column(title, justify="left" if title in ("agent", "set") else "right")
+    for place, title in enumerate(lines[0]):
+        whole = max(len(line[place]) for line in lines[1:]) if title == "agent" else None  # not cut in a narrow terminal
+        table.add_column(title, justify="left" if title in ("agent", "set") else "right", min_width=whole, overflow="fold")
     for line in lines[1:]:
         table.add_row(*map(escape, line))
     console.print(table)

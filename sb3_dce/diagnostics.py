@@ -7,8 +7,9 @@ import time
 import warnings
 
 from sb3_dce.attaching import AttachingMixin
-from sb3_dce.errors import SB3DCEWarning
-from sb3_dce.execution import Engine, refuse_divergence
+from sb3_dce.divergence import Rewind, not_finite
+from sb3_dce.errors import DivergenceError, SB3DCEWarning
+from sb3_dce.execution import Engine
 from sb3_dce.state import TrainState
 
 # There as soon as a row of the log has its diagnostics.
@@ -21,6 +22,7 @@ class DiagnosticsMixin(AttachingMixin):
     _engine: Engine[TrainState] | None
     _metrics_read_at: tuple[int, int]
     _warned_large_q: bool
+    _rewind: Rewind | None
 
     def derived_metrics(self, means: dict[str, float]) -> dict[str, float]:
         """
@@ -29,9 +31,21 @@ class DiagnosticsMixin(AttachingMixin):
         """
         return {}
 
+    def divergence(self, names: list[str]) -> DivergenceError:
+        """
+        :param names: metrics that are not finite
+        :return: what is to be raised
+        """
+        raise NotImplementedError
+
     def _refuse_divergence(self) -> None:
         if self._engine is not None:
-            refuse_divergence(self._engine.metrics.read(clear=False), self._metrics_read_at[1], self._n_updates)
+            self._refuse(self._engine.metrics.read(clear=False))
+
+    def _refuse(self, means: dict[str, float]) -> None:
+        if names := not_finite(means):
+            raise self.divergence(names)
+        self._rewind = None  # the next update begins with a copy of what is good now
 
     def read_metrics(self) -> dict[str, float]:
         """
@@ -44,7 +58,7 @@ class DiagnosticsMixin(AttachingMixin):
             return {}
         means = self._engine.metrics.read()
         then, updates_then = self._metrics_read_at
-        refuse_divergence(means, updates_then, self._n_updates)
+        self._refuse(means)
         if not means:
             return {}
         now = time.time_ns()

@@ -23,7 +23,7 @@ import torch as th
 from torch.utils._pytree import tree_leaves
 
 from sb3_dce.capture import CapturedStep, Draw, StaticInputs, Step
-from sb3_dce.errors import DivergenceError, SB3DCEWarning
+from sb3_dce.errors import SB3DCEWarning
 from sb3_dce.metric_sums import MetricSums
 from sb3_dce.state import Storage
 
@@ -127,23 +127,6 @@ class State(Protocol):
 
 
 S = TypeVar("S", bound=State)
-
-
-def refuse_divergence(means: dict[str, float], first: int, last: int) -> None:
-    """
-    :param means: metrics as read from :class:`MetricSums`
-    :param first: completed updates before the averaged interval
-    :param last: completed updates at its end
-    :raises DivergenceError: if a metric is not finite
-    """
-    bad = [name for name, value in means.items() if value != value or value in (float("inf"), float("-inf"))]
-    if bad:
-        named = ", ".join(bad[:4]) + (f" and {len(bad) - 4} more" if len(bad) > 4 else "")  # in a few updates all of them
-        raise DivergenceError(
-            f"training diverged between updates {first} and {last}: {named} not finite",
-            hint="Check the dataset for huge values, lower learning_rate (and beta, if there is one), or set max_grad_norm.",
-            index=last,
-        )
 
 
 class Engine(Generic[S]):

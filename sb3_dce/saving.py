@@ -38,7 +38,7 @@ ABOUT_ARGUMENTS = ("The specified policy kwargs",)
 CHOOSES_ROWS = frozenset({"fraction", "d4rl_compat"})
 # Not in the zip: what is large, what can be made again, and what SB3 would pickle although nothing needs it.
 EXCLUDED = (
-    *("planned_updates", "_transitions", "_engine", "_generator", "_coef", "_metrics_read_at"),
+    *("planned_updates", "_transitions", "_engine", "_generator", "_coef", "_metrics_read_at", "_rewind"),
     *("_last_obs", "_last_episode_starts", "_last_original_obs", "ep_info_buffer", "ep_success_buffer"),
 )
 

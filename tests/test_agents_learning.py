@@ -229,8 +229,11 @@ def test_training_reads_nothing_back(agent: Agent, transitions: Transitions, mon
 
 def test_absurd_learning_rate_is_noticed(agent: Agent, transitions: Transitions) -> None:
     model = make(agent, dataset=transitions, learning_rate=1e30)
-    with pytest.raises(DivergenceError, match=r"diverged between updates 0 and 10.*not finite"):
+    with pytest.raises(DivergenceError, match=r"diverged at update [123]: .*not finite") as caught:
         model.learn(20, log_interval=10)
+    # what was finite last can be saved
+    assert model._n_updates == model.num_timesteps == int(caught.value.index or 0) - 1
+    assert all(bool(th.isfinite(parameter).all()) for parameter in model.policy.parameters())
 
 
 def test_broken_numbers_in_the_buffer_are_noticed(agent: Agent, transitions: Transitions) -> None:
@@ -241,8 +244,24 @@ def test_broken_numbers_in_the_buffer_are_noticed(agent: Agent, transitions: Tra
     buffer.rows = buffer.rows.clone()
     column = 0 if agent.cls is OfflineBC else buffer.obs_dim + buffer.action_dim
     buffer.rows[::3, column] = float("inf")
-    with pytest.raises(DivergenceError, match="not finite"):
+    with pytest.raises(DivergenceError, match=r"at update 1: .*(observations|rewards) not finite in rows \d+, .*"):
         model.learn(20, log_interval=5)
+
+
+def test_update_that_diverged_is_named_with_its_row(agent: Agent, transitions: Transitions, tmp_path: Path) -> None:
+    """Found later, the update is the one that drew the row; the model goes back to before it, whatever the log's interval."""
+    model = make(agent, dataset=transitions, batch_size=2, seed=3)
+    model.attach_dataset()
+    buffer = model.replay_buffer
+    assert isinstance(buffer, OfflineReplayBuffer)
+    buffer.rows = buffer.rows.clone()
+    buffer.rows[7, 0 if agent.cls is OfflineBC else buffer.obs_dim + buffer.action_dim] = float("inf")
+    with pytest.raises(DivergenceError, match=r"not finite in row 7 of the buffer\. The model was put back") as caught:
+        model.learn(1000)
+    before = int(caught.value.index or 0) - 1
+    assert model._n_updates == model.num_timesteps == before > 0
+    model.save(tmp_path / "finite.zip")
+    assert agent.cls.load(tmp_path / "finite.zip")._n_updates == before
 
 
 @pytest.mark.parametrize("key", ["observations", "actions", "rewards", "next_observations"])
