@@ -284,6 +284,7 @@ class AttachingMixin(OffPolicyAlgorithm):
                 if self.dataset is not None:
                     how = "that were added to the replay buffer" if buffer.n_added else "of the replay buffer"
                     warnings.warn(f"training on {buffer.size():,} rows {how}; {self.dataset} is not read", DatasetWarning)
+                self._warn_of_misfits(buffer)
             return
         transitions, known = self._load_transitions(), self.dataset_statistics
         buffer.attach(transitions, self.chosen_rows(transitions))
@@ -304,13 +305,17 @@ class AttachingMixin(OffPolicyAlgorithm):
                 where=self.dataset,
                 hint="Read the data as before and give them to model.set_dataset(...); it also takes other data.",
             )
+        self._warn_of_misfits(buffer)
+        self._standardize(buffer.observations)
+        self._transitions = None  # the buffer holds the rows now
+
+    def _warn_of_misfits(self, buffer: OfflineReplayBuffer) -> None:
+        assert self.dataset_statistics is not None
         if buffer.size() < self.batch_size:
             text = f"{buffer.size():,} rows for batches of {self.batch_size}: every batch draws rows more than once"
             warnings.warn(text, DatasetWarning)
-        for text in self.check_dataset_fits(self._mean_reward(), info.n_terminals):
+        for text in self.check_dataset_fits(self._mean_reward(), self.dataset_statistics["n_terminals"]):
             warnings.warn(text, DatasetWarning)
-        self._standardize(buffer.observations)
-        self._transitions = None  # the buffer holds the rows now
 
     def chosen_rows(self, transitions: Transitions) -> np.ndarray | None:
         """

@@ -342,20 +342,20 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
         return (n_updates // every + 1) * every
 
     def derived_metrics(self, means: dict[str, float]) -> dict[str, float]:
+        n, extra = self._n_updates, {"epoch": self._n_updates / self.steps_per_epoch}
+        if self.penalty_form != "linear":  # another form does not lower Q on the data by beta_eff at each step
+            return extra
         # Q is linear in beta: every change of beta shifts it as if it had been there alone
-        n, changes = self._n_updates, self._beta_schedule().changes(self._n_updates)
-        shift = sum(shift_factor(n - at, self.gamma, self.tau) * beta_eff(by, self.td_loss_coef) for at, by in changes)
-        extra = {
-            "beta_pred_shift": shift,
-            "epoch": self._n_updates / self.steps_per_epoch,
-        }
+        changes = self._beta_schedule().changes(n)
+        factors = [(shift_factor(n - at, self.gamma, self.tau), by) for at, by in changes]
+        extra["beta_pred_shift"] = sum(factor * beta_eff(by, self.td_loss_coef) for factor, by in factors)
         if self.dataset_statistics is not None:
             extra["survival_margin"] = self._mean_reward() - means["beta_eff"]
         return extra
 
     def check_dataset_fits(self, reward_mean: float, n_terminals: int) -> list[str]:
         shift = beta_eff(self._beta_schedule().largest, self.td_loss_coef)
-        if n_terminals > 0 and shift > reward_mean:
+        if self.penalty_form == "linear" and n_terminals > 0 and shift > reward_mean:
             return [
                 f"beta / (2 * td_loss_coef) = {shift:.3g} is above the mean reward per step {reward_mean:.3g} of data with "
                 "true terminals: ending an episode becomes attractive. Lower beta."

@@ -80,10 +80,13 @@ class DiagnosticsMixin(AttachingMixin):
             return
         largest = self._reward_factor() * self.dataset_statistics["reward_abs_max"] + abs(self.reward_shift)
         bound = 10.0 * largest / (1.0 - self.gamma)
-        if abs(metrics.get("q_data", 0.0)) > bound:
+        # of the policy's actions it can run away alone, where these are far from the data's
+        places = {"on the data": metrics.get("q_data", 0.0), "of the policy's actions": metrics.get("q_policy", 0.0)}
+        where = max(places, key=lambda place: abs(places[place]))
+        if abs(places[where]) > bound:
             self._warned_large_q = True
             warnings.warn(
-                f"mean Q on the data is {metrics['q_data']:.3g} after {self._n_updates} updates, beyond 10 times the largest "
+                f"mean Q {where} is {places[where]:.3g} after {self._n_updates} updates, beyond 10 times the largest "
                 f"return the rewards allow ({bound:.3g}): the critics are diverging. Try a smaller "
                 f"learning_rate{' or a larger beta' if hasattr(self, 'beta') else ''}.",
                 SB3DCEWarning,

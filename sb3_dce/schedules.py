@@ -66,7 +66,7 @@ class StepSchedule:
         :param n_updates: completed updates before the step
         :return: value in force during the next update
         """
-        if self.final is None:
+        if self.final is None or self.final == self.initial:
             return self.initial
         moved = self.initial - (n_updates // self.every) * self.rate
         return max(moved, self.final) if self.final <= self.initial else min(moved, self.final)

@@ -398,7 +398,13 @@ def test_beta_changes_only_after_fifty_whole_epochs() -> None:
 
 @pytest.mark.parametrize(
     ("schedule", "largest"),
-    [((4.0, 0.1, 3.9), 4.0), ((4.0, 18.0, -14.0), 18.0), ((4.0, None, 0.0), 4.0), ((4.0, 18.0, 0.0), 4.0)],
+    [
+        ((4.0, 0.1, 3.9), 4.0),
+        ((4.0, 18.0, -14.0), 18.0),
+        ((18.0, 18.0, -14.0), 18.0),
+        ((4.0, None, 0.0), 4.0),
+        ((4.0, 18.0, 0.0), 4.0),
+    ],
 )
 def test_largest_beta_is_one_the_schedule_reaches(schedule: tuple[float, float | None, float], largest: float) -> None:
     assert StepSchedule(*schedule).largest == largest == max(StepSchedule(*schedule).value(n) for n in (0, 10**9))

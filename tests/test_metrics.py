@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import math
+import warnings
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,6 +22,7 @@ from update_tools import record_steps
 
 from sb3_dce import OfflineDCE, Transitions
 from sb3_dce.base import OfflineAlgorithm
+from sb3_dce.envs import SpacesEnv
 from sb3_dce.errors import DatasetWarning, SB3DCEWarning
 
 
@@ -123,6 +126,16 @@ def test_largest_beta_of_a_schedule_is_compared_with_the_reward(schedule: dict[s
         dce(transitions, **schedule).learn(1)
 
 
+def test_beta_is_compared_with_the_rewards_of_a_loaded_buffer(
+    transitions: Transitions, spaces_env: SpacesEnv, tmp_path: Path
+) -> None:
+    dce(transitions).learn(1).save_replay_buffer(tmp_path / "buffer.pkl")
+    model = OfflineDCE("MlpPolicy", spaces_env, beta=6.0, batch_size=16, execution="eager", policy_kwargs={"net_arch": [8]})
+    model.load_replay_buffer(tmp_path / "buffer.pkl")
+    with pytest.warns(DatasetWarning, match="= 3 is above"):
+        model.learn(1)
+
+
 def test_values_beyond_what_the_rewards_allow_are_said(transitions: Transitions) -> None:
     model = dce(transitions)
     with th.no_grad():
@@ -131,6 +144,21 @@ def test_values_beyond_what_the_rewards_allow_are_said(transitions: Transitions)
     with pytest.warns(SB3DCEWarning, match="critics are diverging") as caught:
         model.learn(2, log_interval=1)
     assert sum("diverging" in str(w.message) for w in caught) == 1
+
+
+def test_values_of_the_policys_actions_that_run_away_alone_are_said(transitions: Transitions) -> None:
+    model = dce(transitions)
+    model.learn(1)
+    with pytest.warns(SB3DCEWarning, match="mean Q of the policy's actions is -5.2e\\+04"):
+        model._warn_of_large_values({"q_data": 3.0, "q_policy": -52_000.0})
+
+
+@pytest.mark.parametrize("form", ["hinge", "cql", "logsumexp"])
+def test_what_holds_for_the_linear_penalty_is_not_said_of_others(form: str, transitions: Transitions) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", DatasetWarning)  # as "ending an episode becomes attractive"
+        model = dce(transitions, beta=20.0, penalty_form=form).learn(1, log_interval=None)
+    assert not {"beta_pred_shift", "survival_margin"} & set(model.read_metrics())
 
 
 def test_expected_shift_and_epoch_are_logged(transitions: Transitions) -> None:
