@@ -77,7 +77,7 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
     :param reward_shift: added to every reward after scaling, reward units
     :param execution: ``"eager"``, ``"compile"`` (one compiled graph), ``"cudagraph"`` (that graph captured, on a CUDA
         device), or ``"auto"``: eager up to 10,000 planned updates, beyond that captured on a CUDA device and, where a C++
-        compiler is there, compiled on a CPU
+        compiler and Python's headers are there, compiled on a CPU
     :param precision: of matrix products: ``"float32"``, ``"bf16-matmul"`` on processors that have it, ``"tf32"`` on a CUDA
         device. Parameters stay float32; the switch is put back after training
     :param stats_window_size: kept for Stable-Baselines3's logger

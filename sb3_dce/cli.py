@@ -69,7 +69,7 @@ def demo(
 @app.command()
 def train(
     dataset: DatasetArgument,
-    algo: Annotated[str, typer.Option(help="Agent: dce, iql, td3bc, ... (the files in zoo_hyperparams).")] = "dce",
+    algo: Annotated[str, typer.Option(help="Agent: dce, bc, td3bc, iql, cql, pbrl, uwac, sac, sac_v or cql_eq18.")] = "dce",
     updates: Annotated[
         float | None, typer.Option(min=1, show_default=False, help="Gradient steps, e.g. 1e6; default: the dataset's row.")
     ] = None,

@@ -68,7 +68,10 @@ def train_population(
     console = console or Console(quiet=True)
     device = get_device(device)
     if device.type == "cpu":
-        return launch([replace(spec, device="cpu") for spec in specs], workers or 1, console)
+        # not said is "auto", and no setting that a run could not go on with
+        chosen = {} if execution == "auto" else {"execution": execution}
+        runs = [replace(spec, device="cpu", overrides={**chosen, **spec.overrides}) for spec in specs]
+        return launch(runs, workers or 1, console)
     workers = max(1, usable_cores() - 1) if workers is None else workers
     return BatchedRuns(specs, device, execution, console, state_file=state_file, workers=workers).run()
 

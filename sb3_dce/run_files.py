@@ -44,7 +44,7 @@ class RunSpec:
     """
     What is to be run.
 
-    :param algo: name of the agent
+    :param algo: full name of the agent, such as ``dce`` or ``offline_iql``
     :param dataset: id or file
     :param seed: fixes networks, batches, noise and evaluation episodes
     :param n_updates: gradient steps

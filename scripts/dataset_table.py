@@ -116,8 +116,10 @@ def page(folder: Path, machine: str) -> str:
         "",
         "Made with `sb3-dce datasets generate <id> --policies <folder>` (`--rows 100000` for the Adroit expert sets), one "
         "process, seed 0, by `python scripts/dataset_table.py`. The policies named `own run` are not published; without them "
-        "`generate` trains such a policy anew, which gives other data of the same kind. The others are public: give their "
-        "zip files with `--policy`. The sets stand in for D4RL's and are not these: scores reached with them cannot be "
+        "`generate` trains such a policy anew, which gives other data of the same kind. The others are public: those of "
+        "rl-trained-agents are zip files for `--policy` (TQC needs sb3_contrib); the pickles of hand_dapg must first be "
+        "written as NPZ (layout: `sb3_dce.recording.policy_files.read_npz_policy`), and `door-human-replayed-sb3` takes the "
+        "replayed episodes as `--buffer`. The sets stand in for D4RL's and are not these: scores reached with them cannot be "
         "compared with published ones. Scores have D4RL's constants; returns are those of the v4 locomotion environments, "
         "and of Adroit with the corrections of this package.",
         "",

@@ -24,7 +24,7 @@ from sb3_dce.data.records import BOUNDS_ATTRIBUTE, DatasetInfo, ReadOptions, bou
 from sb3_dce.data.row_cache import cached_rows
 from sb3_dce.data.sb3_buffer import arrays_from_replay_buffer, load_saved_buffer
 from sb3_dce.data.tables import Columns, arrays_from_csv, arrays_from_dataframe, arrays_from_parquet, numbered
-from sb3_dce.errors import DatasetError, DatasetSemanticsError, DatasetWarning
+from sb3_dce.errors import DatasetError, DatasetFormatError, DatasetSemanticsError, DatasetWarning
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -66,8 +66,10 @@ class Transitions:
         for name, (shape, dtype) in expected.items():
             array = getattr(self, name)
             if array.shape != shape or array.dtype != dtype or not array.flags.c_contiguous:
-                raise ValueError(
-                    f"{name} must be contiguous {dtype.__name__} of shape {shape}, got {array.dtype} {array.shape}"
+                raise DatasetFormatError(
+                    f"{name} must be contiguous {dtype.__name__} of shape {shape}, got {array.dtype} {array.shape}",
+                    key=name,
+                    hint="Use Transitions.from_arrays, or sb3_dce.load_dataset, which make it so.",
                 )
         object.__setattr__(self, "_base_rows", self.rows)
         for name in expected:

@@ -32,7 +32,7 @@ LABELS = {
     "probe_max": "max OOD Q - in-data Q",
     "probe_min": "min OOD Q - in-data Q",
 }
-WIDTH, HEIGHT, COLUMNS = 4.6, 3.6, 3
+WIDTH, HEIGHT, COLUMNS = 4.6, 4.2, 3
 
 
 def draw(evidence: Evidence, folder: Path, name: str) -> list[Path]:
@@ -129,7 +129,8 @@ def _panel(evidence: Evidence, panel: Panel, axes: Axes) -> None:
     if curves:
         for name in _missing(evidence, panel, curves):
             axes.plot([], [], linestyle="none", label=f"{name}: no curve")
-        axes.legend(fontsize=7, framealpha=0.6)
+        # below: inside, it would hide the beginning of a curve
+        axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, frameon=False)
     else:
         axes.set(xticks=[], yticks=[])
         axes.text(0.5, 0.5, _absence(evidence, panel), ha="center", va="center", transform=axes.transAxes, color="0.4")

@@ -31,12 +31,15 @@ HEADINGS = {
 }
 
 
-def write_page(path: Path, out: Path, evidences: Mapping[str, Evidence], reports: Mapping[str, Report], command: str) -> None:
+def write_page(
+    path: Path, out: Path, evidences: Mapping[str, Evidence], reports: Mapping[str, Report], scale: str, command: str
+) -> None:
     """
     :param path: page to write
     :param out: folder with ``figures/`` and ``tables/``, linked from the page
     :param evidences: by experiment
     :param reports: by experiment
+    :param scale: of the experiments
     :param command: by which the page is made again
     """
     link = Path(os.path.relpath(out.resolve(), path.resolve().parent)).as_posix()
@@ -63,7 +66,7 @@ def write_page(path: Path, out: Path, evidences: Mapping[str, Evidence], reports
         own_table_facts().markdown(),
     ]
     for name, report in reports.items():
-        parts += _section(name, evidences[name], report, link)
+        parts += _section(name, evidences[name], report, scale, link)
     write_text(path, "\n\n".join(part.strip("\n") for part in parts) + "\n")
 
 
@@ -91,9 +94,9 @@ def coverage(evidences: Mapping[str, Evidence]) -> list[str]:
     return found
 
 
-def _section(name: str, evidence: Evidence, report: Report, link: str) -> list[str]:
+def _section(name: str, evidence: Evidence, report: Report, scale: str, link: str) -> list[str]:
     experiment = evidence.experiment
-    parts = [f"## {experiment.title}", f"`sb3-dce reproduce {name}` ({', '.join(experiment.items)})."]
+    parts = [f"## {experiment.title}", f"`sb3-dce reproduce {name} --scale {scale}` ({', '.join(experiment.items)})."]
     for table_name, table in report.tables.items():
         if table_name in HEADINGS:
             parts += [f"### {HEADINGS[table_name]}", table.markdown()]

@@ -145,7 +145,7 @@ def reproduce(request: Request, console: Console) -> dict[str, Report]:
         evidence = Evidence(experiment, rows, scales[experiment.id], length, hash_here)
         evidences[experiment.id], reports[experiment.id] = evidence, _report(evidence, request.out, console)
     if request.page is not None:
-        write_page(request.page, request.out, evidences, reports, _command(request))
+        write_page(request.page, request.out, evidences, reports, request.scale, _command(request))
         console.print(f"page   {request.page}", markup=False)
     raise_first(errors, console)
     return reports

@@ -457,7 +457,9 @@ def _leading(evidence: Evidence) -> list[Verdict]:
         missing = [name for of in scores.values() for name, s in of.items() if not len(s)]
         absent = [f"{name} on {missing.count(name)} of {len(ids)} sets" for name in sorted(set(missing))]
         numbers = ", ".join(f"{name}: {place} ({evidence.scope(name, agents)})" for name, place in places.items())
-        numbers = f"place of DCE: {numbers or '-'}" + (f"; without {', '.join(absent)}" if absent else "")
+        numbers = f"place of DCE: {numbers or '-'}" + (
+            f"; without (no runs of this length) {', '.join(absent)}" if absent else ""
+        )
         found.append(judge(claim, rule, holds, numbers))
     return found
 
