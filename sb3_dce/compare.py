@@ -17,6 +17,7 @@ from rich.table import Table
 
 from sb3_dce.agents import agent_class
 from sb3_dce.checks import check_ends_with_evaluation
+from sb3_dce.configuration import config_hash
 from sb3_dce.data import find_file, load_transitions
 from sb3_dce.data.catalog import DatasetSpec, normalized_score
 from sb3_dce.data.hashes import sha256_once
@@ -147,7 +148,7 @@ def report(dataset: str, algos: Sequence[str], out: Path | None, console: Consol
     :raises ConfigError: without a complete run, or if one was trained on another file
     """
     folder, wanted = out or default_folder(dataset), {full_name(algo) for algo in algos}
-    runs: dict[str, dict[str, list[RunSpec]]] = {}
+    runs: dict[str, dict[tuple[str, str], list[RunSpec]]] = {}
     for path in sorted(folder.glob("*/seed_*"), key=lambda path: (path.parent.name, len(path.name), path.name)):
         config = read_config(path)
         if config is None or (wanted and config["run"]["algo"] not in wanted):
@@ -161,12 +162,15 @@ def report(dataset: str, algos: Sequence[str], out: Path | None, console: Consol
             what = f"trained on another file ({config['dataset']['name']}) than {dataset}"
             raise ConfigError(what, where=str(path), hint="Name that one, or another folder with --out.")
         how = f"{spec.n_updates:,} updates{''.join(f', {k}={v}' for k, v in sorted(spec.overrides.items()))}"
-        runs.setdefault(spec.algo, {}).setdefault(how, []).append(spec)
+        how += f", evaluated over {spec.n_eval_episodes} episodes every {spec.eval_freq:,}"
+        # another version of the row of hyperparameters is another agent
+        row = config_hash(spec.algo, config.get("hyperparameters", {}))
+        runs.setdefault(spec.algo, {}).setdefault((how, row), []).append(spec)
     chosen = []
     for algo, kinds in runs.items():
         shown = max(kinds.values(), key=len)
         chosen += shown
-        for how, others in kinds.items():
+        for (how, _), others in kinds.items():
             if others is not shown:
                 console.print(f"left out: {len(others)} of {algo} with {how}", markup=False)
     if not chosen:
@@ -317,12 +321,17 @@ def _cells(rows: list[Row], data_level: float | None, scored: bool) -> list[list
 
 def _show(lines: list[list[str]], console: Console) -> None:
     table = Table(box=None, header_style="bold")
-    for place, title in enumerate(lines[0]):
-        whole = max(len(line[place]) for line in lines[1:]) if title == "agent" else None  # not cut in a narrow terminal
-        table.add_column(title, justify="left" if title in ("agent", "set") else "right", min_width=whole, overflow="fold")
+    # what was set stands below: a column of it would leave no room in a terminal
+    shown = [place for place, title in enumerate(lines[0]) if title != "set"]
+    for place in shown:
+        whole = max(len(line[place]) for line in lines[1:]) if place == 0 else None  # names are not cut
+        table.add_column(lines[0][place], justify="right" if place else "left", min_width=whole)
     for line in lines[1:]:
-        table.add_row(*map(escape, line))
+        table.add_row(*(escape(line[place]) for place in shown))
     console.print(table)
+    for line in lines[1:]:
+        if "set" in lines[0] and line[1]:
+            console.print(f" {line[0]} with {line[1]}", markup=False)
 
 
 def _write_markdown(path: Path, title: str, lines: list[list[str]], notes: list[str], picture: Path | None) -> None:

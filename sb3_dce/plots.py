@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sb3_dce.evaluation import Evaluation
 from sb3_dce.student import mean_interval
 
-# Names of more lines than this stand beside the picture.
-MOST_INSIDE = 5
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+COLORS = [f"C{i}" for i in range(10) if i != 7]  # that one is grey
+# Of more agents each has a panel of its own.
+MOST_TOGETHER = 5
 
 
 def plot_learning_curves(
@@ -36,34 +41,55 @@ def plot_learning_curves(
         from matplotlib.figure import Figure
     except ImportError:
         return None
-    wide = len(curves) + len(levels or {}) > MOST_INSIDE
-    figure = Figure(figsize=(9.0 if wide else 7.0, 4.2), layout="constrained")  # no pyplot: no window system is touched
-    axes = figure.add_subplot()
     scored = all(e.score is not None for seeds in curves.values() for seed in seeds for e in seed)
-    for number, (name, seeds) in enumerate(curves.items()):
-        color = f"C{number}"
-        for seed in seeds:
-            axes.plot([e.n_updates for e in seed], [_value(e, scored) for e in seed], color=color, alpha=0.3, linewidth=0.8)
-        steps = sorted(set.intersection(*({e.n_updates for e in seed} for seed in seeds)))
-        values = np.array([[_value(e, scored) for e in seed if e.n_updates in steps] for seed in seeds])
-        label = f"{name} (mean of {len(seeds)} seeds)" if len(seeds) > 1 else name
-        axes.plot(steps, values.mean(axis=0), color=color, linewidth=2.0, label=label)
-        if len(seeds) > 1:
-            low, high = mean_interval(values) if confidence and len(seeds) > 2 else (values.min(axis=0), values.max(axis=0))
-            axes.fill_between(steps, low, high, color=color, alpha=0.15, linewidth=0)
-    for number, (name, level) in enumerate((levels or {}).items()):
-        axes.axhline(level, color="0.3", linestyle=("--", ":", "-.")[number % 3], linewidth=1.0, label=name)
-    axes.set_xlabel("gradient steps")
-    axes.set_ylabel("normalised score" if scored else "return")
-    axes.set_title(title)
-    axes.grid(alpha=0.3)
-    if wide:
-        figure.legend(loc="outside right upper", fontsize=8)
-    else:
-        axes.legend(loc="best", fontsize=8)
+    agents = [_Agent(name, COLORS[i % len(COLORS)], seeds, scored) for i, (name, seeds) in enumerate(curves.items())]
+    together = len(agents) <= MOST_TOGETHER
+    columns = 1 if together else min(MOST_TOGETHER, -(-len(agents) // 2))
+    lines = 1 if together else -(-len(agents) // columns)
+    # no pyplot: no window system is touched
+    figure = Figure(figsize=(7.0, 4.2) if together else (2.9 * columns, 2.8 * lines), layout="constrained")
+    first = None
+    for number in range(1 if together else len(agents)):
+        axes = first = figure.add_subplot(lines, columns, number + 1, sharex=first, sharey=first)
+        if not together:  # all bands in one picture would hide each other
+            for agent in agents:
+                axes.plot(agent.steps, agent.mean, color="0.8", linewidth=0.8)
+        for agent in agents if together else [agents[number]]:
+            agent.draw(axes, confidence)
+        for style, (name, level) in zip(("--", ":", "-."), (levels or {}).items(), strict=False):
+            axes.axhline(level, color="0.3", linestyle=style, linewidth=1.0, label=name)
+        axes.grid(alpha=0.3)
+        axes.legend(loc="best", fontsize=8 if together else 7)
+        axes.label_outer()
+    figure.supxlabel("gradient steps", fontsize=10)
+    figure.supylabel("normalised score" if scored else "return", fontsize=10)
+    figure.suptitle(title if together else f"{title} (grey: the other agents)", fontsize=11)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)
     return path
+
+
+class _Agent:
+    """Curves of one agent."""
+
+    def __init__(self, name: str, color: str, seeds: list[list[Evaluation]], scored: bool) -> None:
+        self.name, self.color = name, color
+        self.seeds = [([e.n_updates for e in seed], [_value(e, scored) for e in seed]) for seed in seeds]
+        self.steps = sorted(set.intersection(*(set(steps) for steps, _ in self.seeds)))
+        common = [[value for step, value in zip(*seed, strict=True) if step in self.steps] for seed in self.seeds]
+        self.values = np.array(common)
+        self.mean = self.values.mean(axis=0)
+
+    def draw(self, axes: Axes, confidence: bool) -> None:
+        n = len(self.seeds)
+        for steps, values in self.seeds:
+            axes.plot(steps, values, color=self.color, alpha=0.3, linewidth=0.8)
+        label = f"{self.name} (mean of {n} seeds)" if n > 1 else self.name
+        axes.plot(self.steps, self.mean, color=self.color, linewidth=2.0, label=label)
+        if n > 1:
+            inside = confidence and n > 2
+            low, high = mean_interval(self.values) if inside else (self.values.min(axis=0), self.values.max(axis=0))
+            axes.fill_between(self.steps, low, high, color=self.color, alpha=0.15, linewidth=0)
 
 
 def _value(evaluation: Evaluation, scored: bool) -> float:

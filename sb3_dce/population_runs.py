@@ -32,7 +32,7 @@ from sb3_dce.launch import launch, progress_display, show_evaluation
 from sb3_dce.population import Population
 from sb3_dce.processes import termination_as_interrupt, usable_cores
 from sb3_dce.rollouts import Rollouts, rollouts_of
-from sb3_dce.run_files import RunSpec, make_logger, read_result, write_config, write_divergence, write_result
+from sb3_dce.run_files import RunSpec, make_logger, read_divergence, read_result, write_config, write_divergence, write_result
 from sb3_dce.runs import alone, refuse_other_run
 
 # Beside the members' folders: how far all have come, and the state of the common random generator.
@@ -133,7 +133,9 @@ class BatchedRuns:
         :return: results in the order of the specifications
         """
         done = [read_result(folder) for folder in self.folders]
-        if all(result is not None and result["n_updates"] == self.total for result in done):
+        ended = [read_divergence(folder) for folder in self.folders]
+        if all(e is not None or (d is not None and d["n_updates"] == self.total) for d, e in zip(done, ended, strict=True)):
+            self._refuse_diverged({index: int(e["n_updates"]) for index, e in enumerate(ended) if e is not None})
             return [result for result in done if result is not None]
         with self._pool, ExitStack() as stack:
             population = self._population()
@@ -297,20 +299,24 @@ class BatchedRuns:
         for index, (spec, model, folder) in enumerate(zip(self.specs, population.models, self.folders, strict=True)):
             if index not in self._diverged and self._save_member(index, model, folder / "model.zip", self.total):
                 results.append(write_result(spec, folder, read_evaluations(folder, catalogue_id(model.dataset)), seconds))
+        for index, n in self._diverged.items():
+            write_divergence(self.folders[index], n, "metrics not finite")
+        # not before all is said: a kill in between goes on from these
         self._state_path.unlink(missing_ok=True)
         for folder in self.folders:
             for path in folder.glob("checkpoint_*.zip"):
                 path.unlink()
-        for index, n in self._diverged.items():
-            write_divergence(self.folders[index], n, "metrics not finite")
-        if self._diverged:
-            names = ", ".join(f"{self.specs[index].name} (update {n:,})" for index, n in self._diverged.items())
+        self._refuse_diverged(self._diverged)
+        return results
+
+    def _refuse_diverged(self, diverged: dict[int, int]) -> None:
+        if diverged:
+            names = ", ".join(f"{self.specs[index].name} (update {n:,})" for index, n in diverged.items())
             raise DivergenceError(
-                f"{len(self._diverged)} of {len(self.specs)} members diverged: {names}; the others are complete",
+                f"{len(diverged)} of {len(self.specs)} members diverged: {names}; the others are complete",
                 where=str(self.common),
                 hint="Lower their learning_rate or raise beta.",
             )
-        return results
 
 
 def members_to_go_on(state_file: Path) -> list[Path]:

@@ -3,23 +3,46 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 
-# 97.5 % quantiles by degrees of freedom, 1 to 10.
-_QUANTILES = np.array([12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228])
+# Points by which densities are integrated.
+_POINTS = 20_001
 
 
-def student_quantile(freedom: float) -> float:
+@lru_cache(maxsize=1024)
+def student_quantile(freedom: float, level: float = 0.95) -> float:
     """
     :param freedom: degrees of freedom, from 1 up; Welch's need not be whole
-    :return: how many standard errors a two-sided 95 % interval reaches to each side, to three digits
+    :param level: probability inside of a two-sided interval
+    :return: how many standard errors the interval reaches to each side
     """
-    if freedom > len(_QUANTILES):
-        return 1.96 + 2.37 / freedom + 2.8 / freedom**2
-    # nearly linear in the inverse
-    known = 1.0 / np.arange(len(_QUANTILES), 0, -1)
-    return float(np.interp(1.0 / freedom, known, _QUANTILES[::-1]))
+    # With sqrt(freedom) tan(angle) for t the density is a power of the cosine, on a bounded interval.
+    angles = np.linspace(0.0, np.pi / 2.0, _POINTS)
+    return float(np.sqrt(freedom) * np.tan(_inverse(angles, np.cos(angles) ** (freedom - 1.0), level)))
+
+
+@lru_cache(maxsize=1024)
+def std_factors(n: int, level: float = 0.95) -> tuple[float, float]:
+    """
+    Interval of a standard deviation (chi-square), as factors of the sample's.
+
+    :param n: numbers of the sample, at least two
+    :param level: probability inside
+    :return: factors of the lower and the upper bound
+    """
+    freedom = n - 1
+    roots = np.linspace(0.0, np.sqrt(freedom) + 10.0, _POINTS)  # of chi-square, whose own density may be infinite at 0
+    density = roots ** (freedom - 1.0) * np.exp(-(roots**2) / 2.0)
+    low, high = (_inverse(roots, density, share) for share in ((1.0 - level) / 2.0, (1.0 + level) / 2.0))
+    return float(np.sqrt(freedom) / high), float(np.sqrt(freedom) / low)
+
+
+def _inverse(points: np.ndarray, density: np.ndarray, share: float) -> float:
+    """Where this share of the area below a density is reached."""
+    area = np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2.0)])
+    return float(np.interp(share * area[-1], area, points))
 
 
 def welch_freedom(errors: Sequence[float], freedoms: Sequence[float]) -> float:

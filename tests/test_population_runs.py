@@ -96,6 +96,10 @@ def test_members_that_diverge_are_named_and_the_others_finish(tmp_path: Path) ->
         BatchedRuns(members, CPU, "eager", Console(quiet=True)).run()
     assert (tmp_path / "seed_0" / "result.json").exists() and not (tmp_path / "seed_1" / "result.json").exists()
     assert read_divergence(tmp_path / "seed_0") is None and read_divergence(tmp_path / "seed_1") is not None
+    written = (tmp_path / "seed_0" / "result.json").stat().st_mtime_ns
+    with pytest.raises(DivergenceError, match="1 of 2 members diverged: dce seed 1"):
+        BatchedRuns(members, CPU, "eager", Console(quiet=True)).run()
+    assert (tmp_path / "seed_0" / "result.json").stat().st_mtime_ns == written, "nothing is trained again"
 
 
 def test_population_goes_on_without_the_member_that_diverged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

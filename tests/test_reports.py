@@ -15,7 +15,7 @@ from sb3_dce.experiments.claims import claim_table, own_table_facts
 from sb3_dce.experiments.curves import panel_curves
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import experiment_ids, load_experiment, variant_hash
-from sb3_dce.experiments.judging import HELD, NOT_HELD, UNTESTED, Verdict
+from sb3_dce.experiments.judging import CLOSE, HELD, NOT_HELD, UNTESTED, Verdict
 from sb3_dce.experiments.pages import coverage
 from sb3_dce.experiments.reports import config_table, make_report, toy_table
 from sb3_dce.experiments.run_times import runtime_table
@@ -123,13 +123,36 @@ def test_a_row_has_one_length_the_one_most_agents_have() -> None:
     assert evidence_of(rows, n_updates=1000).last(TABLE.variant("DCE"), "walker2d-medium-sb3").tolist() == [1.0]
 
 
+def test_totals_are_of_data_of_one_length() -> None:
+    parts = [
+        table_rows(TABLE, {name: scores()}, n_updates=n_updates)
+        for name, n_updates in (("walker2d-medium-sb3", 1000), ("hopper-medium-sb3", 1000), (CHEETAH, 2000))
+    ]
+    evidence = evidence_of(results.merge(parts))
+    assert sorted(common_rows(evidence, "sb3")) == ["hopper-medium-sb3", "walker2d-medium-sb3"]
+
+
+def test_what_is_left_of_an_agent_that_diverged_has_no_total_and_is_ahead_of_nobody() -> None:
+    rows = table_rows(TABLE, {name: scores(CQL=[90.0, 91.0, 92.0], BC=[1.0] * 3) for name in HALFCHEETAHS})
+    lost = run_rows(TABLE, "CQL", CHEETAH, 3).iloc[:1].assign(metric="diverged", step=300, value=1.0)
+    evidence = evidence_of(results.merge([rows, lost]))
+    assert cell(score_table(evidence), CHEETAH, "ours: CQL") == "91.0 ± 1.0 (1 diverged)", "not bold"
+    totals = {row[0]: row[1:] for row in aggregate_tables(evidence)["sb3"].rows}
+    assert set(totals["CQL (1 diverged)"]) == {"-"} and totals["DCE"][0] != "-"
+    only = {name: scores(CQL=[90.0, 91.0, 92.0] if name == CHEETAH else [1.0] * 3) for name in HALFCHEETAHS}
+    whole = table_rows(TABLE, only)
+    assert claim_of(whole, "C4").outcome == NOT_HELD
+    assert claim_of(results.merge([whole, lost]), "C4").outcome != NOT_HELD, "what is ahead there has failed"
+
+
 def test_agent_with_runs_of_another_length_alone_is_shown_with_it_and_compared_with_nobody() -> None:
     others = {name: values for name, values in scores().items() if name != "PBRL"}
     long = table_rows(TABLE, {"walker2d-medium-sb3": others}, n_updates=50_000)
     short = table_rows(TABLE, {"walker2d-medium-sb3": {"PBRL": [90.0, 92.0]}}, n_updates=10_000, seconds=20.0)
     evidence = evidence_of(results.merge([long, short]))
     table = score_table(evidence)
-    assert cell(table, "walker2d-medium-sb3", "ours: PBRL") == "91.0 ± 1.4 (after 10,000)", "not bold, though the best"
+    shown = cell(table, "walker2d-medium-sb3", "ours: PBRL")
+    assert shown == "91.0 ± 1.4 (after 10,000, 2 seeds)", "not bold, though the best"
     assert cell(table, "walker2d-medium-sb3", "ours: BC") == "**42.0 ± 2.0**"
     assert "PBRL" not in {row[0] for row in aggregate_tables(evidence)["sb3"].rows}
     assert {row[0]: row[2] for row in runtime_table(evidence).rows}["PBRL"] == "2.0"
@@ -288,7 +311,7 @@ def test_claims_on_places_are_not_tested_on_d4rl_and_own_data_together() -> None
 def test_claims_on_places_need_all_the_papers_agents_at_one_length() -> None:
     without = {name: values for name, values in scores(DCE=[90.0]).items() if name != "PBRL"}
     verdict = claim_of(table_rows(TABLE, {name: without for name in HALFCHEETAHS}), "C4")
-    assert verdict.outcome == UNTESTED and "without PBRL" in verdict.numbers
+    assert verdict.outcome == UNTESTED and "without runs of this length: PBRL" in verdict.numbers
     parts = [table_rows(TABLE, {n: scores(DCE=[90.0])}, n_updates=1000 * (i + 1)) for i, n in enumerate(HALFCHEETAHS)]
     assert claim_of(results.merge(parts), "C4").outcome == UNTESTED
 
@@ -348,6 +371,9 @@ def test_agent_that_diverges_is_one_that_fails() -> None:
     lost = run_rows(returns, "Eq. 18, alpha 5", CHEETAH, 0).iloc[:1].assign(metric="diverged", step=300, value=1.0)
     verdict = claim_of(results.merge([*parts, lost]), "At alpha 5", "fig-alpha-return")
     assert verdict.outcome == HELD
+    values = {"Eq. 18, alpha 1": 12.0, "Eq. 18, alpha 5": 5.9}
+    near = [run_rows(returns, v.name, CHEETAH, 0, values.get(v.name, 40.0)) for v in returns.variants]
+    assert claim_of(results.merge(near), "At alpha 5", "fig-alpha-return").outcome == CLOSE, "two single runs"
     weak = [run_rows(returns, v.name, CHEETAH, 0, 2.0) for v in returns.variants]
     assert claim_of(results.merge(weak), "At alpha 5", "fig-alpha-return").outcome == UNTESTED, "half of nothing is nothing"
 
@@ -390,7 +416,7 @@ def test_file_that_is_here_counts_where_rows_of_two_are_known() -> None:
 
 
 def test_reproduction_counts_rows_of_d4rl_at_the_papers_length_only() -> None:
-    table = {"walker2d-medium-v2": {"DCE": [84.0, 85.0]}, "hopper-medium-v2": {"DCE": [10.0, 11.0]}}
+    table = {"walker2d-medium-v2": {"DCE": [84.0, 85.0] * 2 + [84.5]}, "hopper-medium-v2": {"DCE": [10.0, 11.0] * 2 + [10.5]}}
     own = {"walker2d-random-sb3": {"DCE": [0.0, 0.0]}}
     verdict = make_report(evidence_of(table_rows(TABLE, {**table, **own}, n_updates=1_000_000))).verdicts[-1]
     missed = "1 of 2 rows, of 12 in the table; missed: hopper-medium-v2 (10.5, paper 75.9)"
@@ -398,6 +424,8 @@ def test_reproduction_counts_rows_of_d4rl_at_the_papers_length_only() -> None:
     hit = table_rows(TABLE, {"walker2d-medium-v2": table["walker2d-medium-v2"]}, n_updates=1_000_000)
     assert make_report(evidence_of(hit)).verdicts[-1].outcome == UNTESTED, "11 rows are not there"
     assert make_report(evidence_of(table_rows(TABLE, table))).verdicts[-1].outcome == UNTESTED, "too short"
+    few = table_rows(TABLE, {"hopper-medium-v2": {"DCE": [10.0, 11.0]}}, n_updates=1_000_000)
+    assert make_report(evidence_of(few)).verdicts[-1].outcome == UNTESTED, "the interval of two seeds overlaps anything"
 
 
 def test_cause_of_a_loss_is_the_change_that_closes_the_gap() -> None:

@@ -507,6 +507,25 @@ def test_nodes_keep_runs_of_other_folders_and_versions_apart(tmp_path: Path, mon
     assert cluster.asker_of(spec) != asker
 
 
+def test_node_with_another_file_trains_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from sb3_dce.experiments.cluster import train_on_node
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    outcome = train_on_node(small_plan("fig-cql-return", tmp_path)[0].spec, "asker", "ab" * 32)
+    assert outcome.files == {} and not outcome.diverged
+    assert outcome.error is not None and "another file" in outcome.error and "(abababab…)" in outcome.error
+
+
+def test_runs_of_an_unfinished_call_are_those_of_their_experiments(tmp_path: Path) -> None:
+    plan = [run for run in small_plan("run-times", tmp_path) if run.variant == "BC"]
+    train(plan)
+    table = [replace(run, experiment="table1") for run in plan]
+    for planned, expected in (([], "fig-beta"), (plan, "run-times"), ([*plan, *table], "table1"), ([*table, *plan], "table1")):
+        rows = results.import_runs(tmp_path / "runs", "fig-beta", planned)
+        assert set(rows["experiment"]) == {expected}
+    assert set(results.planned_rows([*table, *plan])["experiment"]) == {"table1"}
+
+
 def test_cluster_that_is_not_there_is_said_in_one_sentence(tmp_path: Path) -> None:
     pytest.importorskip("ray")
     with pytest.raises(ConfigError, match=r"no Ray cluster at 127\.0\.0\.1:1"):

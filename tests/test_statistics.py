@@ -19,7 +19,7 @@ from sb3_dce.experiments.statistics import (
     total,
     trimmed_mean,
 )
-from sb3_dce.student import student_quantile
+from sb3_dce.student import std_factors, student_quantile
 
 
 def test_interquartile_mean_of_one_to_eight() -> None:
@@ -129,9 +129,21 @@ def test_a_task_with_more_seeds_weighs_no_more() -> None:
 
 @pytest.mark.parametrize(("freedom", "quantile"), [(1, 12.706), (2, 4.303), (4, 2.776), (7, 2.365), (20, 2.086), (60, 2.000)])
 def test_student_quantile_is_that_of_the_tables(freedom: float, quantile: float) -> None:
-    assert student_quantile(freedom) == pytest.approx(quantile, rel=3e-3)
+    assert student_quantile(freedom) == pytest.approx(quantile, rel=3e-4)
+
+
+@pytest.mark.parametrize(("level", "quantile"), [(0.99, 4.604), (0.999, 8.610)])
+def test_student_quantile_of_other_levels(level: float, quantile: float) -> None:
+    assert student_quantile(4, level) == pytest.approx(quantile, rel=3e-4)
+
+
+@pytest.mark.parametrize(
+    ("n", "level", "factors"), [(5, 0.95, (0.599, 2.874)), (2, 0.95, (0.446, 31.91)), (5, 0.99, (0.519, 4.396))]
+)
+def test_interval_of_a_standard_deviation_is_that_of_chi_square(n: int, level: float, factors: tuple[float, float]) -> None:
+    assert std_factors(n, level) == pytest.approx(factors, rel=2e-3)
 
 
 def test_interval_of_a_mean_reaches_beyond_the_range_of_three_seeds() -> None:
     low, high = mean_interval(np.array([1.0, 2.0, 3.0]))
-    assert (low, high) == pytest.approx((2.0 - 4.303 / 3**0.5, 2.0 + 4.303 / 3**0.5))
+    assert (low, high) == pytest.approx((2.0 - 4.3027 / 3**0.5, 2.0 + 4.3027 / 3**0.5), abs=1e-4)

@@ -22,8 +22,10 @@ import torch as th
 from rich.console import Console
 
 import sb3_dce
+from sb3_dce.data import find_file
+from sb3_dce.data.hashes import sha256_once
 from sb3_dce.data.locate import cache_folder
-from sb3_dce.errors import ConfigError, DivergenceError, SB3DCEError
+from sb3_dce.errors import ConfigError, DatasetIntegrityError, DivergenceError, SB3DCEError
 from sb3_dce.files import write_atomically
 from sb3_dce.launch import train_one
 from sb3_dce.processes import threads_from_environment
@@ -92,7 +94,7 @@ def _knock(address: str) -> None:
 
 def _collect(ray: Any, specs: Sequence[RunSpec], console: Console) -> list[BaseException]:
     remote = ray.remote(num_cpus=1, max_retries=2, scheduling_strategy="SPREAD")(train_on_node)
-    waiting = {remote.remote(spec, asker_of(spec)): spec for spec in specs}
+    waiting = {remote.remote(spec, asker_of(spec), sha256_once(find_file(spec.dataset)[0])): spec for spec in specs}
     console.print(
         f"{len(specs)} runs wait for the {ray.cluster_resources().get('CPU', 0):g} cores of the cluster", markup=False
     )
@@ -130,12 +132,13 @@ def asker_of(spec: RunSpec) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-def train_on_node(spec: RunSpec, asker: str) -> Outcome:
+def train_on_node(spec: RunSpec, asker: str, sha256: str) -> Outcome:
     """
     What a node does.
 
     :param spec: run, with the folder it has on the machine that asked for it
     :param asker: from :func:`asker_of`
+    :param sha256: of the data file there; rows of two files could not be put together
     :return: its files
     """
     th.set_num_threads(threads_from_environment() or 1)
@@ -143,6 +146,7 @@ def train_on_node(spec: RunSpec, asker: str) -> Outcome:
     folder = cache_folder().parent / "cluster" / node / f"{Path(spec.folder).name}--{asker}"
     here = replace(spec, folder=str(folder))
     try:
+        _refuse_other_data(spec.dataset, sha256)
         train_one(here, lambda progress: None)
     except DivergenceError as error:
         return Outcome(node, send(folder), str(error), diverged=True)
@@ -152,6 +156,17 @@ def train_on_node(spec: RunSpec, asker: str) -> Outcome:
         return Outcome(node, {}, traceback.format_exc(limit=-3), diverged=False)
     assert read_result(folder) is not None
     return Outcome(node, send(folder), None, diverged=False)
+
+
+def _refuse_other_data(dataset: str, sha256: str) -> None:
+    path = find_file(dataset)[0]
+    if (own := sha256_once(path)) != sha256:
+        raise DatasetIntegrityError(
+            f"another file (sha256 {own[:8]}…) than on the machine that asked ({sha256[:8]}…)",
+            where=str(path),
+            path=path,
+            hint="Copy that one to the node: what a node generates has other last digits.",
+        )
 
 
 def send(folder: Path) -> dict[str, bytes]:

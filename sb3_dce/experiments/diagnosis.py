@@ -23,8 +23,10 @@ def score_of(evidence: Evidence, variant: Variant, dataset_id: str) -> float | N
     :param evidence: rows
     :param variant: column
     :param dataset_id: row
-    :return: mean of the last scores, ``None`` without runs
+    :return: mean of the last scores, ``None`` without runs, or if one diverged: the agent has failed then
     """
+    if evidence.n_diverged(variant, dataset_id):
+        return None
     scores = evidence.last(variant, dataset_id)
     return float(scores.mean()) if len(scores) else None
 
@@ -86,6 +88,8 @@ def verdict_of(evidence: Evidence, dataset_id: str) -> str:
     scores = {v.name: score_of(evidence, v, dataset_id) for v in experiment.variants}
     dce = scores["DCE"]
     rivals = {name: score for name in RIVALS if (score := scores[name]) is not None}
+    if lost := evidence.n_diverged(experiment.variant("DCE"), dataset_id):
+        return f"DCE diverged on {lost} of {evidence.runs(experiment.variant('DCE'), dataset_id)['seed'].nunique()} seeds"
     if dce is None or not rivals:
         return "not tested"
     best = max(rivals, key=rivals.__getitem__)

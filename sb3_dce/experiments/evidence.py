@@ -324,7 +324,8 @@ class Evidence:
         :return: as :meth:`tail`
         """
         late = curve[curve.index > (1.0 - TAIL) * (self.n_updates(dataset_id) or 0)]
-        return float(np.nanmean(late.to_numpy())) if late.notna().any(axis=None) else None
+        # each seed counts the same, however often it was evaluated
+        return float(late.mean().mean()) if late.notna().any(axis=None) else None
 
     # -- theory ----------------------------------------------------------------------------------------------------
 

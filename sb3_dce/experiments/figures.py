@@ -14,7 +14,7 @@ from sb3_dce.experiments.curves import panel_curves, variants_of
 from sb3_dce.experiments.evidence import UPDATES_PER_EPOCH, Evidence
 from sb3_dce.experiments.grid import Panel
 from sb3_dce.experiments.statistics import performance_profile
-from sb3_dce.experiments.tables import common_rows, compared
+from sb3_dce.experiments.tables import common_rows, compared, n_diverged
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -69,7 +69,8 @@ def draw_profile(evidence: Evidence, part: str, folder: Path, name: str) -> list
     figure = _figure(1.5 * WIDTH, HEIGHT)
     axes = figure.add_subplot()
     ids = common_rows(evidence, part)
-    scores = {v.name: [evidence.last(v, i) for i in ids] for v in compared(evidence, ids)}
+    whole = [v for v in compared(evidence, ids) if not n_diverged(evidence, v, ids)]
+    scores = {v.name: [evidence.last(v, i) for i in ids] for v in whole}
     every = np.concatenate([task for tasks in scores.values() for task in tasks])
     thresholds = np.linspace(min(0.0, every.min()), max(100.0, every.max()), 201)
     for number, (agent, tasks) in enumerate(scores.items()):
@@ -108,12 +109,13 @@ def _save(figure: Figure, folder: Path, name: str) -> list[Path]:
 def _panel(evidence: Evidence, panel: Panel, axes: Axes) -> None:
     curves = panel_curves(evidence, panel)
     colors = _colors(evidence, panel, list(curves))
-    for name, (curve, theory) in curves.items():
+    for number, (name, (curve, theory)) in enumerate(curves.items()):
         color, epochs = colors[name], np.asarray(curve.index) / UPDATES_PER_EPOCH
         if curve.shape[1] > 1:
             axes.plot(epochs, curve.to_numpy(), color=color, alpha=0.25, linewidth=0.7)
         label = f"{name} ({curve.shape[1]} seeds)" if curve.shape[1] > 1 else name
-        axes.plot(epochs, curve.mean(axis=1).to_numpy(), color=color, linewidth=1.6, label=label)
+        width = 2.4 - 1.2 * number / max(1, len(curves) - 1)  # what lies below another line can be seen
+        axes.plot(epochs, curve.mean(axis=1).to_numpy(), color=color, linewidth=width, label=label)
         if theory is not None:
             axes.plot(epochs, theory.to_numpy(), color=color, linestyle="--", linewidth=1.0, label=f"{name}, theory")
     axes.set_xlabel("epoch (1000 gradient steps)")

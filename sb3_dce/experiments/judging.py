@@ -7,16 +7,16 @@ From numbers to outcomes: what a claim is tested with, and when two scores are t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import Variant
-from sb3_dce.experiments.paper import paper_score
+from sb3_dce.experiments.paper import PAPER_SEEDS, paper_score
 from sb3_dce.experiments.statistics import sample_std
-from sb3_dce.student import student_quantile, welch_freedom
+from sb3_dce.student import std_factors, student_quantile, welch_freedom
 
 HELD, NOT_HELD, CLOSE, UNTESTED = "held", "did not hold", "too close to tell", "could not be tested"
 
@@ -162,11 +162,12 @@ def above(values: Values | None, first: str, second: str) -> bool | str | None:
     return differs(values[first] - values[second], values.errors[first], values.errors[second])
 
 
-def differs(difference: float, one: Uncertainty, other: Uncertainty) -> bool | str:
+def differs(difference: float, one: Uncertainty, other: Uncertainty, n_tests: int = 1) -> bool | str:
     """
     :param difference: of two scores
     :param one: uncertainty of the first
     :param other: uncertainty of the second
+    :param n_tests: differences any of which would decide a claim: the 5 % are divided among them (Bonferroni)
     :return: whether it is positive, ``CLOSE`` within the 95 % interval of Welch's test
     """
     error = math.hypot(one.error, other.error)
@@ -174,7 +175,23 @@ def differs(difference: float, one: Uncertainty, other: Uncertainty) -> bool | s
         return CLOSE if difference == 0 else difference > 0
     freedom = welch_freedom((one.error, other.error), (one.freedom, other.freedom))
     freedom = min([freedom, *(each.freedom for each in (one, other) if each.borrowed)])
-    return CLOSE if abs(difference) <= student_quantile(freedom) * error else difference > 0
+    return CLOSE if abs(difference) <= student_quantile(freedom, 1.0 - 0.05 / n_tests) * error else difference > 0
+
+
+def spreads_beyond(spreads: Mapping[str, np.ndarray], limit: float) -> bool | str | None:
+    """
+    :param spreads: scores by data, one per seed
+    :param limit: of their standard deviation
+    :return: whether it is above on some data, false if it is below on all, by its 95 % interval, divided among the data;
+        ``None`` without data with as many seeds as the paper's
+    """
+    known = [scores for scores in spreads.values() if len(scores) >= PAPER_SEEDS]
+    if not known:
+        return None
+    intervals = [sample_std(s) * np.array(std_factors(len(s), 1.0 - 0.05 / len(known))) for s in known]
+    if any(low > limit for low, _ in intervals):
+        return True
+    return False if all(high < limit for _, high in intervals) else CLOSE
 
 
 def all_of(parts: Iterable[bool | str | None]) -> bool | str | None:

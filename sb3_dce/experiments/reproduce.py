@@ -136,7 +136,10 @@ def reproduce(request: Request, console: Console) -> dict[str, Report]:
         rows = results.merge([_known(request), *(results.import_runs(f, request.ids[0]) for f in request.imports)])
         _keep_rows(rows, request, results.empty())
         # runs of an unfinished call with this folder are shown, and left for it to keep
-        rows = results.merge([rows, results.import_runs(request.out / "runs", request.ids[0])])
+        here = replace(request, datasets=(PRESENT,))
+        planned = [run for e in experiments for run in plan_runs(e, scales[e.id], here)]
+        unfinished = results.import_runs(request.out / "runs", request.ids[0], planned)
+        rows = results.merge([rows, results.without(unfinished, rows)])
         if rows.empty:
             console.print(f"no result rows in {request.out}/rows: nothing has been run", markup=False)
     evidences, reports = {}, {}
@@ -347,7 +350,10 @@ def _report(evidence: Evidence, out: Path, console: Console) -> Report:
     for part in parts_of(evidence):
         if f"aggregates-{part}" in report.tables:
             written += draw_profile(evidence, part, out / "figures", f"{experiment.id}-profile-{part}")
-    if report.has_figure:
+    if not report.has_figure:
+        for ending in ("png", "svg"):  # of rows that are no longer there
+            (out / "figures" / f"{experiment.id}.{ending}").unlink(missing_ok=True)
+    else:
         written += draw(evidence, out / "figures", experiment.id)
         console.print(report.caption, markup=False)
     for verdict in report.verdicts:

@@ -104,13 +104,16 @@ def rows_of_run(folder: Path, experiment: str) -> pd.DataFrame | None:
     return _ordered(pd.DataFrame([{**common, "step": s, "metric": m, "value": v} for s, m, v in finite]))
 
 
-def import_runs(folder: Path, experiment: str) -> pd.DataFrame:
+def import_runs(folder: Path, experiment: str, planned: Iterable[PlannedRun] = ()) -> pd.DataFrame:
     """
     :param folder: anywhere above folders of runs
     :param experiment: id of the experiment they are taken for
+    :param planned: runs of grids, which are taken for these
     :return: rows of all complete runs below
     """
-    found = [rows_of_run(path.parent, experiment) for path in sorted(folder.rglob("config.yml"))]
+    of_plan = {Path(run.spec.folder): run.experiment for run in sorted(planned, key=lambda run: run.experiment != TIMING)}
+    folders = [path.parent for path in sorted(folder.rglob("config.yml"))]
+    found = [rows_of_run(path, of_plan.get(path, experiment)) for path in folders]
     return merge(rows for rows in found if rows is not None)
 
 
@@ -119,7 +122,8 @@ def planned_rows(planned: Iterable[PlannedRun]) -> pd.DataFrame:
     :param planned: runs of a grid
     :return: rows of those that are complete, each run once
     """
-    by_folder = {run.spec.folder: run.experiment for run in planned}
+    # a run of two experiments is one of scores, not of times alone
+    by_folder = {run.spec.folder: run.experiment for run in sorted(planned, key=lambda run: run.experiment != TIMING)}
     found = [rows_of_run(Path(folder), experiment) for folder, experiment in by_folder.items()]
     return merge(rows for rows in found if rows is not None)
 

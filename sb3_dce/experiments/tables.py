@@ -50,7 +50,8 @@ def score_table(evidence: Evidence) -> TextTable:
             rows.append((f"{dataset.twin or dataset.paper}: {dataset.absence}", *("" for _ in variants), paper, *printed))
         for name in ids:
             columns = [evidence.last(v, name) for v in variants]
-            best, counts = _best_interval(columns), [len(scores) for scores in columns if len(scores)]
+            counts = [len(scores) for scores in columns if len(scores)]
+            best = _best_interval([s for v, s in zip(variants, columns, strict=True) if not evidence.n_diverged(v, name)])
             usual = max(counts, key=lambda n: (counts.count(n), n), default=0)
             cells = tuple(score_cell(evidence, v, name, best, usual) for v in variants)
             note = f" ({dataset.note})" if dataset.note and name == dataset.twin else ""
@@ -78,10 +79,11 @@ def _total_rows(evidence: Evidence, methods: list[str]) -> list[tuple[str, ...]]
             ids = [name for dataset in wanted for name in evidence.ids(dataset) if source_of(name) == source]
             if source == "sb3" and not ids:
                 continue
-            totals = []
+            totals, lengths = [], {evidence.n_updates(name) for name in ids}
             for variant in evidence.experiment.variants:
                 scores = [evidence.last(variant, name) for name in ids]
-                whole = len(ids) == len(wanted) and all(map(len, scores))
+                whole = len(ids) == len(wanted) and all(map(len, scores)) and len(lengths) == 1
+                whole = whole and not any(evidence.n_diverged(variant, name) for name in ids)
                 totals.append(f"{sum(task.mean() for task in scores):.1f}" if whole else "-")
             label = f"total of {len(wanted)} {family} sets, {'D4RL' if source == 'D4RL' else 'our own'}"
             found.append((label, *totals, "", *(paper if source == "D4RL" else ("",) * len(paper))))
@@ -102,14 +104,19 @@ def score_cell(evidence: Evidence, variant: Variant, dataset_id: str, best: Inte
     if not len(scores):
         other = evidence.last_of_other_length(variant, dataset_id)
         if other is not None:
-            return f"{_mean_and_spread(other[0])} (after {other[1]:,})"
+            n = "" if len(other[0]) == usual else f", {_seeds(other[0])}"
+            return f"{_mean_and_spread(other[0])} (after {other[1]:,}{n})"
         return lost.strip() or "-"
     text = _mean_and_spread(scores)
-    if best is not None and len(scores) > 1 and mean_interval(scores).overlaps(best):
+    if best is not None and not diverged and len(scores) > 1 and mean_interval(scores).overlaps(best):
         text = f"**{text}**"
     if len(scores) != usual:
-        text += f" ({len(scores)} seed{'s' if len(scores) > 1 else ''})"
+        text += f" ({_seeds(scores)})"
     return text + lost
+
+
+def _seeds(scores: np.ndarray) -> str:
+    return f"{len(scores)} seed{'s' if len(scores) > 1 else ''}"
 
 
 def _mean_and_spread(scores: np.ndarray) -> str:
@@ -143,30 +150,44 @@ def common_rows(evidence: Evidence, part: str) -> list[str]:
     """
     :param evidence: rows
     :param part: one of :func:`parts_of`
-    :return: data of this part on which every agent of the paper has a score, but for agents that have run on fewer than half
-        of the data of the one with the most: a total over the little they have would say nothing about the others
+    :return: data of this part on which every agent of the paper has runs, all of the commonest length, but for agents that
+        have run on fewer than half of the data of the one with the most: a total over the little they have would say nothing
+        about the others
     """
     ids = _rows_of_part(evidence, part)
     papers = [v for v in evidence.experiment.variants if v.paper is not None]
-    counts = [sum(len(evidence.last(v, name)) > 0 for name in ids) for v in papers]
+    counts = [sum(len(evidence.runs(v, name)) > 0 for name in ids) for v in papers]
     variants = [v for v, count in zip(papers, counts, strict=True) if count and 2 * count >= max(counts)]
-    return [name for name in ids if variants and all(len(evidence.last(v, name)) for v in variants)]
+    ids = [name for name in ids if variants and all(len(evidence.runs(v, name)) for v in variants)]
+    lengths = [evidence.n_updates(name) or 0 for name in ids]
+    usual = max(lengths, key=lambda n: (lengths.count(n), n), default=0)
+    return [name for name, length in zip(ids, lengths, strict=True) if length == usual]
 
 
 def compared(evidence: Evidence, ids: list[str]) -> list[Variant]:
     """
     :param evidence: rows
     :param ids: data
-    :return: columns with a score on all of them that are not DCE once more ("one setting" where it is the row's everywhere)
+    :return: columns with runs on all of them that are not DCE once more ("one setting" where it is the row's everywhere)
     """
     hashes: list[list[str]] = []
     found = []
     for variant in evidence.experiment.variants:
         runs = [evidence.key_of(variant, name) for name in ids]
-        if variant.datasets is None and runs not in hashes and all(len(evidence.last(variant, name)) for name in ids):
+        if variant.datasets is None and runs not in hashes and all(len(evidence.runs(variant, name)) for name in ids):
             hashes.append(runs)
             found.append(variant)
     return found
+
+
+def n_diverged(evidence: Evidence, variant: Variant, ids: list[str]) -> int:
+    """
+    :param evidence: rows
+    :param variant: column
+    :param ids: data
+    :return: its runs there that diverged; an agent with one has failed, and what is left of it is no total
+    """
+    return sum(evidence.n_diverged(variant, name) for name in ids)
 
 
 def _rows_of_part(evidence: Evidence, part: str) -> list[str]:
@@ -194,7 +215,7 @@ def aggregate_tables(evidence: Evidence) -> dict[str, TextTable]:
 
 def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
     variants = compared(evidence, ids)
-    dce = next((v for v in variants if v.name == "DCE"), None)
+    dce = next((v for v in variants if v.name == "DCE" and not n_diverged(evidence, v, ids)), None)
     paper_rows = [evidence.paper_id(dataset) for dataset, name in evidence.table_rows() if name in ids]
     header = (
         *("agent", "total", "paper's style of ± (sum of stds)", "std of the total"),
@@ -202,6 +223,9 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
     )
     rows = []
     for variant in variants:
+        if lost := n_diverged(evidence, variant, ids):
+            rows.append((f"{variant.name} ({lost} diverged)", *("-" for _ in header[1:])))
+            continue
         scores = [evidence.last(variant, name) for name in ids]
         stds = [sample_std(task) for task in scores]
         sums = total([task.mean() for task in scores], stds)
@@ -225,10 +249,10 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
         )
     note = (
         f"Over {_counted(len(ids))} on which the paper's agents have runs of one length; those that were run on fewer than "
-        "half of the data are left out. IQM is the mean of the middle half of all scores, P(DCE > agent) the share of pairs "
-        "of runs on the same data in which DCE scores more. Each data set has the same weight. The interval is a "
-        f"stratified bootstrap over seeds within data sets ({N_RESAMPLES:,} resamples; none with one seed); the deviation of "
-        f"the total takes the rows as independent. {MIXED_PROTOCOLS}"
+        "half of the data are left out. An agent that diverged on a seed has no total. IQM is the mean of the middle half of "
+        "all scores, P(DCE > agent) the share of pairs of runs on the same data in which DCE scores more. Each data set has "
+        f"the same weight. The interval is a stratified bootstrap over seeds within data sets ({N_RESAMPLES:,} resamples; "
+        f"none with one seed); the deviation of the total takes the rows as independent. {MIXED_PROTOCOLS}"
     )
     return TextTable(header, tuple(rows), f"{evidence.caption(ids, variants)} {note}")
 
