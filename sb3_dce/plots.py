@@ -59,11 +59,15 @@ def plot_learning_curves(
         for style, (name, level) in zip(("--", ":", "-."), (levels or {}).items(), strict=False):
             axes.axhline(level, color="0.3", linestyle=style, linewidth=1.0, label=name)
         axes.grid(alpha=0.3)
-        axes.legend(loc="best", fontsize=8 if together else 7)
         axes.label_outer()
+        if together:
+            axes.legend(loc="best", fontsize=8)
+        else:
+            axes.set_title(agents[number].label, fontsize=9, color=agents[number].color)
     figure.supxlabel("gradient steps", fontsize=10)
     figure.supylabel("normalised score" if scored else "return", fontsize=10)
-    figure.suptitle(title if together else f"{title} (grey: the other agents)", fontsize=11)
+    others = ", ".join(["grey: the other agents", *(f"dashed: {name}" for name in levels or {})])
+    figure.suptitle(title if together else f"{title} ({others})", fontsize=11)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)
     return path
@@ -73,19 +77,19 @@ class _Agent:
     """Curves of one agent."""
 
     def __init__(self, name: str, color: str, seeds: list[list[Evaluation]], scored: bool) -> None:
-        self.name, self.color = name, color
+        self.color = color
         self.seeds = [([e.n_updates for e in seed], [_value(e, scored) for e in seed]) for seed in seeds]
         self.steps = sorted(set.intersection(*(set(steps) for steps, _ in self.seeds)))
         common = [[value for step, value in zip(*seed, strict=True) if step in self.steps] for seed in self.seeds]
         self.values = np.array(common)
         self.mean = self.values.mean(axis=0)
+        self.label = f"{name} (mean of {len(seeds)} seeds)" if len(seeds) > 1 else name
 
     def draw(self, axes: Axes, confidence: bool) -> None:
         n = len(self.seeds)
         for steps, values in self.seeds:
             axes.plot(steps, values, color=self.color, alpha=0.3, linewidth=0.8)
-        label = f"{self.name} (mean of {n} seeds)" if n > 1 else self.name
-        axes.plot(self.steps, self.mean, color=self.color, linewidth=2.0, label=label)
+        axes.plot(self.steps, self.mean, color=self.color, linewidth=2.0, label=self.label)
         if n > 1:
             inside = confidence and n > 2
             low, high = mean_interval(self.values) if inside else (self.values.min(axis=0), self.values.max(axis=0))

@@ -118,7 +118,8 @@ def verdict_of(evidence: Evidence, dataset_id: str) -> str:
     if half is not None and end is not None and abs(end - half) >= SHARE * gap:
         causes.append(f"{'still rising' if end > half else 'falling'} ({half:.1f} in the middle of the run)")
     if (longer := evidence.last_of_longer(variant, dataset_id)) is not None:
-        causes.append(f"{longer[0].mean():.1f} after {longer[1]:,} steps ({len(longer[0])} seeds)")
+        n = len(longer[0])
+        causes.append(f"{longer[0].mean():.1f} after {longer[1]:,} steps ({n} seed{'s' if n > 1 else ''})")
     if not causes or not changed:
         excluded.insert(0, "none of the changes explains it" if changed else "no change was run")
     behind = f"behind {best} by {gap:.1f}" + (", which seeds can do" if close else "")

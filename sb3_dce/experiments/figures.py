@@ -153,8 +153,10 @@ def _add_returns(axes: Axes, dataset_id: str) -> None:
 
 
 def _colors(evidence: Evidence, panel: Panel, lines: list[str]) -> dict[str, str]:
-    """A variant has one colour in all panels."""
-    order = lines if panel.over or panel.lines else [v.name for v in evidence.experiment.variants]
+    """A variant has one colour in all panels, and so has a beta of the probe."""
+    betas = sorted({beta for other in evidence.experiment.panels for beta in other.lines})
+    order = lines if panel.over else [f"beta {beta:g}" for beta in betas] if panel.lines else []
+    order = order or [v.name for v in evidence.experiment.variants]
     return {name: f"C{order.index(name) % 10}" for name in lines}
 
 
