@@ -134,10 +134,10 @@ def page(folder: Path, machine: str) -> str:
         "present recorder by itself. Joined and copied sets record no steps.",
         "",
         "The training results in this repository were made on files that were written at other times, some from other numbers "
-        "of rows: `halfcheetah-medium-sb3` of 500 episodes (sha256 `9a761263…`), the three `-medium-expert-sb3` of 500,000 and "
-        "500,000 rows (`--rows 1000000`), and the buffers of the `-replay-` sets before they were copied into this layout (the "
-        "same steps). Results name the hash, not only the id; [cards](cards) of these files are what `sb3-dce datasets compare` "
-        "wants.",
+        "of rows: `halfcheetah-medium-sb3` of 500 episodes (sha256 `9a761263…`), the three `-medium-expert-sb3` of 500,000 "
+        "and 500,000 rows (`--rows 1000000`), and the buffers of the `-replay-` sets before they were copied into this layout "
+        "(the same steps). Results name the hash, not only the id; [cards](cards) of these files are what `sb3-dce datasets "
+        "compare` wants.",
         "",
         "## Where they come from",
         "",
