@@ -105,8 +105,10 @@ def policy_penalty(q_values: Sequence[th.Tensor], beta: float | th.Tensor) -> th
 
 def sum_over_critics(values: Sequence[th.Tensor]) -> th.Tensor:
     """
+    Sum over the critics, whose losses have no common factor.
+
     :param values: one tensor per critic, equal shapes
-    :return: their sum
+    :return: same shape
     """
     total = values[0]
     for value in values[1:]:
