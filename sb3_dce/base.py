@@ -24,7 +24,7 @@ from sb3_dce.attaching import DatasetLike
 from sb3_dce.buffers import OfflineReplayBuffer
 from sb3_dce.checks import check_choice, check_number, check_optional, check_seed, check_steps
 from sb3_dce.diagnostics import RECORDED, DiagnosticsMixin
-from sb3_dce.divergence import Rewind, locate, refuse
+from sb3_dce.divergence import Rewind, locate
 from sb3_dce.envs import SpacesEnv
 from sb3_dce.errors import ConfigError, DivergenceError
 from sb3_dce.execution import EXECUTIONS, Engine, Update, choose_execution
@@ -175,6 +175,8 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
     networks: ClassVar[tuple[str, ...]]
     # Length of the run that these updates belong to, where it is known: what is resumed is executed as it was begun.
     planned_updates: int | None = None
+    # Attributes that :meth:`read_state` changes.
+    adapted_parameters: ClassVar[tuple[str, ...]] = ()
     # Parameters of the subclass in which the members of a population may differ, since they reach the update as numbers.
     population_scalars: ClassVar[frozenset[str]] = frozenset()
 
@@ -383,8 +385,9 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         rates = self.learning_rates()
         for name, storage in engine.state.storages.items():
             storage.set_learning_rate(rates.get(f"{name}_learning_rate", rates["learning_rate"]))
-        if self._rewind is None or self._rewind.engine is not engine:
-            self._rewind = Rewind.of(engine, generator, self._n_updates)
+        known = self._rewind
+        if known is None or known.engine is not engine or known.batch_size != batch_size:
+            self._rewind = Rewind.of(self, engine, batch_size)
         assert buffer.rows is not None
         source = (buffer.rows.data_ptr(), buffer.size(), batch_size, self.precision, tuple(specs.items()))
 
@@ -417,9 +420,7 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
 
     def divergence(self, names: list[str]) -> DivergenceError:
         last = self._n_updates
-        error = refuse(names, self._metrics_read_at[1], last)
-        if self._rewind is not None:
-            error = locate(self, self._rewind) or error
+        error = locate(self, self._rewind, names, self._metrics_read_at[1])
         self._rewind = None
         self.num_timesteps += self._n_updates - last
         return error

@@ -168,11 +168,12 @@ def report(dataset: str, algos: Sequence[str], out: Path | None, console: Consol
         runs.setdefault(spec.algo, {}).setdefault((how, row), []).append(spec)
     chosen = []
     for algo, kinds in runs.items():
-        shown = max(kinds.values(), key=len)
-        chosen += shown
-        for (how, _), others in kinds.items():
-            if others is not shown:
-                console.print(f"left out: {len(others)} of {algo} with {how}", markup=False)
+        shown = max(kinds, key=lambda kind: len(kinds[kind]))
+        chosen += kinds[shown]
+        for (how, row), others in kinds.items():
+            if (how, row) != shown:
+                other = ", with another row of hyperparameters" if how == shown[0] else ""
+                console.print(f"left out: {len(others)} of {algo} with {how}{other}", markup=False)
     if not chosen:
         raise ConfigError("no complete run", where=str(folder), hint="Run the comparison first, without --report-only.")
     return _summarize(dataset, folder, chosen, console)

@@ -5,8 +5,9 @@ is not finite has spread to all others. So the updates since the last look are m
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch as th
 from torch.utils._pytree import tree_leaves
@@ -29,32 +30,69 @@ class Rewind(NamedTuple):
     :param engine: what makes the updates
     :param tensors: copies of its state's tensors
     :param generator: state of the random generator
+    :param adapted: attributes that the agent changes by what its updates have found
     :param n_updates: completed updates
+    :param num_timesteps: of the model
+    :param batch_size: rows per update from there on
     """
 
     engine: Engine[TrainState]
     tensors: list[th.Tensor]
     generator: th.Tensor
+    adapted: dict[str, Any]
     n_updates: int
+    num_timesteps: int
+    batch_size: int
 
     @classmethod
-    def of(cls, engine: Engine[TrainState], generator: th.Generator, n_updates: int) -> Rewind:
+    def of(cls, model: OfflineAlgorithm, engine: Engine[TrainState], batch_size: int) -> Rewind:
         """
-        :param engine: what makes the updates
-        :param generator: what they draw with
-        :param n_updates: completed updates
+        :param model: about to be trained
+        :param engine: what makes its updates
+        :param batch_size: rows per update
         :return: copies of all that an update changes
         """
         tensors = [tensor.clone() for tensor in tree_leaves(engine.state.read())]
-        return cls(engine, tensors, generator.get_state(), n_updates)
+        adapted = {name: copy.deepcopy(getattr(model, name)) for name in model.adapted_parameters}
+        counts = (model._n_updates, model.num_timesteps, batch_size)
+        return cls(engine, tensors, model._training_generator().get_state(), adapted, *counts)
 
-    def restore(self, generator: th.Generator) -> None:
+    def restore(self, model: OfflineAlgorithm) -> None:
         """
-        :param generator: as given to :meth:`of`; it and the state are put back
+        :param model: put back, but for its count of timesteps
         """
-        for tensor, copy in zip(tree_leaves(self.engine.state.read()), self.tensors, strict=True):
-            tensor.copy_(copy)
-        generator.set_state(self.generator)
+        for tensor, saved in zip(tree_leaves(self.engine.state.read()), self.tensors, strict=True):
+            tensor.copy_(saved)
+        model._training_generator().set_state(self.generator)
+        for name, value in self.adapted.items():
+            setattr(model, name, copy.deepcopy(value))
+        model._n_updates = self.n_updates
+        self.engine.metrics.read()
+
+    def repeat(self, model: OfflineAlgorithm) -> list[str]:
+        """
+        Make the next update again.
+
+        :param model: between :meth:`restore` and where it had come to
+        :return: metrics that are not finite
+        """
+        if model.num_timesteps != self.num_timesteps:  # within learn(), whose schedules follow the timesteps
+            at = self.num_timesteps + model._n_updates - self.n_updates
+            model._update_current_progress_remaining(
+                max(self.num_timesteps, at - at % model.gradient_steps), model._total_timesteps
+            )
+        model.train(1, self.batch_size)
+        return not_finite(self.engine.metrics.read())
+
+    def is_finite(self) -> bool:
+        """
+        :return: whether the state is now
+        """
+        return _are_finite(tree_leaves(self.engine.state.read()))
+
+
+def _are_finite(tensors: list[th.Tensor]) -> bool:
+    return all(bool(th.isfinite(tensor).all()) for tensor in tensors)
 
 
 def not_finite(metrics: dict[str, float]) -> list[str]:
@@ -65,52 +103,42 @@ def not_finite(metrics: dict[str, float]) -> list[str]:
     return [name for name, value in metrics.items() if value != value or value in (float("inf"), float("-inf"))]
 
 
-def refuse(names: list[str], first: int, last: int) -> DivergenceError:
-    """
-    :param names: metrics that are not finite
-    :param first: completed updates before the interval they are means of
-    :param last: completed updates at its end
-    :return: what is to be raised
-    """
-    return DivergenceError(
-        f"training diverged between updates {first} and {last}: {_listed(names)} not finite", hint=HINT, index=last
-    )
-
-
-def locate(model: OfflineAlgorithm, rewind: Rewind) -> DivergenceError | None:
+def locate(model: OfflineAlgorithm, rewind: Rewind | None, names: list[str], first: int) -> DivergenceError:
     """
     Find the update that made the first number that is not finite, and go back to before it, so that the model can be saved.
 
     :param model: that has diverged
-    :param rewind: from before
-    :return: what is to be raised; ``None`` if the updates cannot be made again as they were, since a callback has changed
-        something meanwhile
+    :param rewind: from before; ``None`` if there is none
+    :param names: metrics that are not finite
+    :param first: completed updates before the interval they are means of
+    :return: what is to be raised. It names the interval alone if the updates cannot be made again as they were: a callback
+        may have changed something meanwhile
     """
-    engine, generator = rewind.engine, model._training_generator()
     last = model._n_updates
-    if engine is not model._engine or not engine.state.is_bound():
-        return None
-    rewind.restore(generator)
-    model._n_updates = rewind.n_updates
-    engine.metrics.read()
-    while model._n_updates < last:
-        before = Rewind.of(engine, generator, model._n_updates)
-        model.train(1, model.batch_size)
-        bad = not_finite(engine.metrics.read())
-        if not bad and all(bool(th.isfinite(tensor).all()) for tensor in tree_leaves(engine.state.read())):
-            continue
-        update = model._n_updates
-        before.restore(generator)
-        rows = model.draw_rows(generator, model.batch_size)
-        before.restore(generator)
-        model._n_updates = before.n_updates
-        what = f"{_listed(bad)} not finite" if bad else "parameters not finite after it"
-        return DivergenceError(
-            f"training diverged at update {update}: {what}{_about(model, rows)}",
-            hint=f"The model was put back to before this update. {HINT}",
-            index=update,
-        )
-    return None
+    what = f"training diverged between updates {first} and {last}: {_listed(names)} not finite"
+    bound = rewind is not None and rewind.engine is model._engine and rewind.engine.state.is_bound()
+    if rewind is None or not bound or not _are_finite(rewind.tensors):
+        return DivergenceError(what, hint=HINT, index=last)
+    rewind.restore(model)
+    bad: list[str] = []
+    while not bad and model._n_updates < last:
+        bad = rewind.repeat(model) or ([] if rewind.is_finite() else ["parameters after it"])
+    update = model._n_updates
+    rewind.restore(model)
+    if not bad:
+        back = f"Made again, the updates stayed finite: the model was put back to after update {rewind.n_updates}."
+        return DivergenceError(what, hint=f"{back} {HINT}", index=last)
+    while model._n_updates < update - 1:  # a second time, which needs no further copy of the state
+        rewind.repeat(model)
+    generator = model._training_generator()
+    drawn = generator.get_state()
+    rows = model.draw_rows(generator, rewind.batch_size)
+    generator.set_state(drawn)
+    return DivergenceError(
+        f"training diverged at update {update}: {_listed(bad)} not finite{_about(model, rows)}",
+        hint=f"The model was put back to before this update. {HINT}",
+        index=update,
+    )
 
 
 def _about(model: OfflineAlgorithm, rows: th.Tensor) -> str:

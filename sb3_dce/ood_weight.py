@@ -19,6 +19,7 @@ N_RECENT, N_RECORDED = 5, 20
 class OODWeight(OfflineAlgorithm):
     """Mixin of agents with the parameters ``ood_weight*``, ``adaptive_ood_weight`` and ``steps_per_epoch``."""
 
+    adapted_parameters: ClassVar[tuple[str, ...]] = ("recorded_q", "n_ood_weight_decays")
     population_scalars: ClassVar[frozenset[str]] = frozenset(
         {"ood_weight", "ood_weight_final", "ood_weight_steps", "ood_weight_next", "ood_weight_decay", "ood_weight_min"}
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -56,7 +57,7 @@ def plot_learning_curves(
                 axes.plot(agent.steps, agent.mean, color="0.8", linewidth=0.8)
         for agent in agents if together else [agents[number]]:
             agent.draw(axes, confidence)
-        for style, (name, level) in zip(("--", ":", "-."), (levels or {}).items(), strict=False):
+        for style, (name, level) in zip(cycle(("--", ":", "-.")), (levels or {}).items(), strict=False):
             axes.axhline(level, color="0.3", linestyle=style, linewidth=1.0, label=name)
         axes.grid(alpha=0.3)
         axes.label_outer()
@@ -66,7 +67,7 @@ def plot_learning_curves(
             axes.set_title(agents[number].label, fontsize=9, color=agents[number].color)
     figure.supxlabel("gradient steps", fontsize=10)
     figure.supylabel("normalised score" if scored else "return", fontsize=10)
-    others = ", ".join(["grey: the other agents", *(f"dashed: {name}" for name in levels or {})])
+    others = ", ".join(["grey: the other agents", *([f"dashed: {', '.join(levels)}"] if levels else [])])
     figure.suptitle(title if together else f"{title} ({others})", fontsize=11)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)

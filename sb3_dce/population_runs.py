@@ -55,7 +55,7 @@ def train_population(
     :param specs: runs of one algorithm with spaces of one shape, of the same length and evaluation frequency, each with a
         folder of its own inside a common one. They may differ in dataset, seed, and numbers such as beta
     :param device: ``"cpu"`` makes each run a process; on ``"cuda"`` they are one batched computation
-    :param execution: as in :class:`~sb3_dce.base.OfflineAlgorithm`
+    :param execution: as in :class:`~sb3_dce.base.OfflineAlgorithm`; on a CPU another than "auto" is a setting of each run
     :param workers: processes. On the CPU each trains one run, default 1; with a GPU they evaluate what was trained so far
         while the training goes on, default: all cores but one, and 0 lets the training wait for its evaluations
     :param console: where progress is shown; ``None`` shows nothing
@@ -135,6 +135,7 @@ class BatchedRuns:
         done = [read_result(folder) for folder in self.folders]
         ended = [read_divergence(folder) for folder in self.folders]
         if all(e is not None or (d is not None and d["n_updates"] == self.total) for d, e in zip(done, ended, strict=True)):
+            self._remove_state()  # a kill may have left it
             self._refuse_diverged({index: int(e["n_updates"]) for index, e in enumerate(ended) if e is not None})
             return [result for result in done if result is not None]
         with self._pool, ExitStack() as stack:
@@ -301,13 +302,15 @@ class BatchedRuns:
                 results.append(write_result(spec, folder, read_evaluations(folder, catalogue_id(model.dataset)), seconds))
         for index, n in self._diverged.items():
             write_divergence(self.folders[index], n, "metrics not finite")
-        # not before all is said: a kill in between goes on from these
+        self._remove_state()  # not before all is said: a kill in between goes on from it
+        self._refuse_diverged(self._diverged)
+        return results
+
+    def _remove_state(self) -> None:
         self._state_path.unlink(missing_ok=True)
         for folder in self.folders:
             for path in folder.glob("checkpoint_*.zip"):
                 path.unlink()
-        self._refuse_diverged(self._diverged)
-        return results
 
     def _refuse_diverged(self, diverged: dict[int, int]) -> None:
         if diverged:

@@ -26,6 +26,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv, VecVideoRecorder
 
 from sb3_dce import OfflineBC, Transitions
+from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.buffers import OfflineReplayBuffer
 from sb3_dce.envs import SpacesEnv
 from sb3_dce.errors import ConfigError, DatasetSemanticsError, DivergenceError
@@ -262,6 +263,54 @@ def test_update_that_diverged_is_named_with_its_row(agent: Agent, transitions: T
     assert model._n_updates == model.num_timesteps == before > 0
     model.save(tmp_path / "finite.zip")
     assert agent.cls.load(tmp_path / "finite.zip")._n_updates == before
+
+
+def break_some_rows(model: OfflineAlgorithm) -> None:
+    model.attach_dataset()
+    buffer = model.replay_buffer
+    assert isinstance(buffer, OfflineReplayBuffer)
+    buffer.rows = buffer.rows.clone()
+    buffer.rows[::75, buffer.obs_dim + buffer.action_dim] = float("inf")
+
+
+def test_updates_are_made_again_with_the_learning_rate_and_the_batches_they_had(transitions: Transitions) -> None:
+    """A falling rate, a chunk of updates per call, and a weight that follows what was found."""
+    settings: dict[str, Any] = {"batch_size": 2, "seed": 3, "gradient_steps": 5, "learning_rate": LinearlyToZero(1e-2)}
+    settings |= {"adaptive_ood_weight": True, "steps_per_epoch": 3, "ood_weight_steps": 1, "n_critics": 3, "n_ood_actions": 2}
+    model, whole = (make(AGENTS["PBRL"], dataset=transitions, **settings) for _ in range(2))
+    break_some_rows(model)
+    with pytest.raises(DivergenceError, match=r"at update \d+: .*rewards not finite in rows? \d+") as caught:
+        model.learn(200)
+    before = int(caught.value.index or 0) - 1
+    whole.learn(200, Recorder(stop_at=before - before % 5), log_interval=None)
+    if before % 5:
+        whole._update_current_progress_remaining(whole.num_timesteps, 200)
+        whole.train(before % 5, 2)
+    assert len(model.recorded_q) == len(whole.recorded_q) > 1  # type: ignore[attr-defined]
+    assert before > 5 and same(weights(model), weights(whole))
+
+
+def test_updates_that_stay_finite_when_made_again_are_said(transitions: Transitions) -> None:
+    class Breaks(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 7:
+                with th.no_grad():
+                    next(self.model.policy.parameters()).fill_(float("nan"))
+            return True
+
+    model = make(AGENTS["DCE"], dataset=transitions)
+    with pytest.raises(DivergenceError, match=r"between updates 0 and 10: .* put back to after update 0\."):
+        model.learn(20, Breaks(), log_interval=10)
+    assert model._n_updates == model.num_timesteps == 0
+    assert all(bool(th.isfinite(parameter).all()) for parameter in model.policy.parameters())
+
+
+def test_divergence_of_train_with_another_batch_size_is_located(transitions: Transitions) -> None:
+    model = make(AGENTS["DCE"], dataset=transitions, batch_size=64, seed=3)
+    break_some_rows(model)
+    model.train(100, 2)
+    with pytest.raises(DivergenceError, match=r"at update \d+: .*rewards not finite in rows? \d+"):
+        model.read_metrics()
 
 
 @pytest.mark.parametrize("key", ["observations", "actions", "rewards", "next_observations"])

@@ -13,7 +13,9 @@ from result_rows import SHA, run_rows, table_rows
 from sb3_dce.experiments import results
 from sb3_dce.experiments.claims import claim_table, own_table_facts
 from sb3_dce.experiments.curves import panel_curves
+from sb3_dce.experiments.diagnosis import variant_table
 from sb3_dce.experiments.evidence import Evidence
+from sb3_dce.experiments.figures import draw_profile
 from sb3_dce.experiments.grid import experiment_ids, load_experiment, variant_hash
 from sb3_dce.experiments.judging import CLOSE, HELD, NOT_HELD, UNTESTED, Verdict
 from sb3_dce.experiments.pages import coverage
@@ -143,6 +145,19 @@ def test_what_is_left_of_an_agent_that_diverged_has_no_total_and_is_ahead_of_nob
     whole = table_rows(TABLE, only)
     assert claim_of(whole, "C4").outcome == NOT_HELD
     assert claim_of(results.merge([whole, lost]), "C4").outcome != NOT_HELD, "what is ahead there has failed"
+
+
+def test_runs_without_scores_and_agents_that_all_diverged_are_no_error(tmp_path: Path) -> None:
+    unscored = table_rows(TABLE, {CHEETAH: scores()}).query("metric != 'score'")
+    assert make_report(evidence_of(unscored)).tables.keys() >= {"scores"} and not common_rows(evidence_of(unscored), "sb3")
+    lost = [
+        run_rows(TABLE, v.name, CHEETAH, 0).iloc[:1].assign(metric="diverged", step=300, value=1.0) for v in TABLE.variants
+    ]
+    evidence = evidence_of(results.merge(lost))
+    assert {cell for row in aggregate_tables(evidence)["sb3"].rows for cell in row[1:]} == {"-"}
+    assert draw_profile(evidence, "sb3", tmp_path, "profile") == []
+    (finding,) = [row[-1] for row in variant_table(evidence_of(results.merge(lost), "why-dce-loses")).rows]
+    assert finding == "DCE diverged on 1 of 1 seeds"
 
 
 def test_agent_with_runs_of_another_length_alone_is_shown_with_it_and_compared_with_nobody() -> None:

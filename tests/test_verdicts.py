@@ -12,7 +12,7 @@ from result_rows import run_rows, table_rows
 from sb3_dce.experiments import results
 from sb3_dce.experiments.claims import claim_table
 from sb3_dce.experiments.evidence import Evidence
-from sb3_dce.experiments.grid import load_experiment
+from sb3_dce.experiments.grid import Experiment, load_experiment
 from sb3_dce.experiments.judging import CLOSE, HELD, NOT_HELD, UNTESTED, uncertainty
 from sb3_dce.experiments.reports import reproduction
 from sb3_dce.experiments.verdicts import verdicts
@@ -211,6 +211,10 @@ def test_best_on_every_set_is_not_best_on_one() -> None:
     assert one_of(outcomes("table1", rows), "C4") == NOT_HELD
 
 
+def steady_rows(table: Experiment, data: str) -> pd.DataFrame:
+    return results.merge(run_rows(table, "DCE", data, s, 40.0 + s) for s in range(5))
+
+
 def test_claim_on_seeds() -> None:
     table = load_experiment("table1")
     hopper = "hopper-medium-sb3"
@@ -218,7 +222,12 @@ def test_claim_on_seeds() -> None:
         rows = results.merge(run_rows(table, "DCE", hopper, s, 40.0 + s * spread) for s in range(5))
         lines = {row[0]: row[2] for row in claim_table({"table1": Evidence(table, rows, table.scales["cpu"])}, {}).rows}
         assert lines["C7"] == expected
-    steady = results.merge(run_rows(table, "DCE", CHEETAH, s, 40.0 + s) for s in range(5))
+    steady = steady_rows(table, CHEETAH)
+    mixed = results.merge(
+        [steady_rows(table, CHEETAH), *(run_rows(table, "DCE", hopper, s, 40.0 + 30.0 * s) for s in range(2))]
+    )
+    lines = {row[0]: row[2] for row in claim_table({"table1": Evidence(table, mixed, table.scales["cpu"])}, {}).rows}
+    assert lines["C7"] == UNTESTED, "two seeds of Hopper"
     few = results.merge(run_rows(table, "DCE", hopper, s, 40.0 + 30.0 * s) for s in range(4))
     lines = {row[0]: row[2] for row in claim_table({"table1": Evidence(table, few, table.scales["cpu"])}, {}).rows}
     assert lines["C7"] == UNTESTED, "four seeds say little on a deviation"

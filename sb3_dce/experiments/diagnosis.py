@@ -40,7 +40,11 @@ def variant_table(evidence: Evidence) -> TextTable:
     rows = []
     for _, name in evidence.table_rows():
         scores = [score_of(evidence, v, name) for v in variants]
-        rows.append((name, *("-" if score is None else f"{score:.1f}" for score in scores), verdict_of(evidence, name)))
+        cells = [
+            "diverged" if evidence.n_diverged(v, name) else "-" if score is None else f"{score:.1f}"
+            for v, score in zip(variants, scores, strict=True)
+        ]
+        rows.append((name, *cells, verdict_of(evidence, name)))
     header = ("data", *(v.name for v in variants), "finding")
     note = (
         f"Each column after DCE changes one thing of the paper's row. A change is named as a cause if it closes at least "
@@ -88,8 +92,8 @@ def verdict_of(evidence: Evidence, dataset_id: str) -> str:
     scores = {v.name: score_of(evidence, v, dataset_id) for v in experiment.variants}
     dce = scores["DCE"]
     rivals = {name: score for name in RIVALS if (score := scores[name]) is not None}
-    if lost := evidence.n_diverged(experiment.variant("DCE"), dataset_id):
-        return f"DCE diverged on {lost} of {evidence.runs(experiment.variant('DCE'), dataset_id)['seed'].nunique()} seeds"
+    if n_lost := evidence.n_diverged(experiment.variant("DCE"), dataset_id):
+        return f"DCE diverged on {n_lost} of {evidence.runs(experiment.variant('DCE'), dataset_id)['seed'].nunique()} seeds"
     if dce is None or not rivals:
         return "not tested"
     best = max(rivals, key=rivals.__getitem__)
@@ -108,6 +112,7 @@ def verdict_of(evidence: Evidence, dataset_id: str) -> str:
             excluded.append(f"survival condition kept (margin {margin:.2f})")
     changes = [v for v in experiment.variants if v.algo == variant.algo and not _is_same(evidence, v, variant, dataset_id)]
     changed = {v.name: score for v in changes if (score := scores[v.name]) is not None}
+    lost = [f"{v.name} diverged" for v in changes if evidence.n_diverged(v, dataset_id)]
     for v in changes:
         name, score = v.name, changed.get(v.name)
         if score is None or score - dce < SHARE * gap:
@@ -120,8 +125,9 @@ def verdict_of(evidence: Evidence, dataset_id: str) -> str:
     if (longer := evidence.last_of_longer(variant, dataset_id)) is not None:
         n = len(longer[0])
         causes.append(f"{longer[0].mean():.1f} after {longer[1]:,} steps ({n} seed{'s' if n > 1 else ''})")
-    if not causes or not changed:
-        excluded.insert(0, "none of the changes explains it" if changed else "no change was run")
+    excluded += lost
+    if not causes or not (changed or lost):
+        excluded.insert(0, "none of the changes explains it" if changed or lost else "no change was run")
     behind = f"behind {best} by {gap:.1f}" + (", which seeds can do" if close else "")
     return f"{behind}: {'; '.join([*causes, *excluded])}"
 

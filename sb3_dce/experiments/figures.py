@@ -63,13 +63,15 @@ def draw_profile(evidence: Evidence, part: str, folder: Path, name: str) -> list
     :param part: of the table, one of :func:`~sb3_dce.experiments.tables.parts_of`
     :param folder: where the pictures are written
     :param name: of the files, without ending
-    :return: PNG and SVG file
+    :return: PNG and SVG file; none if every agent diverged on a seed
     :raises ConfigError: without matplotlib
     """
-    figure = _figure(1.5 * WIDTH, HEIGHT)
-    axes = figure.add_subplot()
     ids = common_rows(evidence, part)
     whole = [v for v in compared(evidence, ids) if not n_diverged(evidence, v, ids)]
+    if not whole:
+        return []
+    figure = _figure(1.5 * WIDTH, HEIGHT)
+    axes = figure.add_subplot()
     scores = {v.name: [evidence.last(v, i) for i in ids] for v in whole}
     every = np.concatenate([task for tasks in scores.values() for task in tasks])
     thresholds = np.linspace(min(0.0, every.min()), max(100.0, every.max()), 201)

@@ -101,7 +101,8 @@ def _section(name: str, evidence: Evidence, report: Report, scale: str, link: st
         if table_name in HEADINGS:
             parts += [f"### {HEADINGS[table_name]}", table.markdown()]
     for part in parts_of(evidence):
-        if f"aggregates-{part}" in report.tables:
+        totals = report.tables.get(f"aggregates-{part}")
+        if totals is not None and any(row[1] != "-" for row in totals.rows):  # else there is no picture
             parts += ["### Performance profile", f"![Performance profile]({link}figures/{name}-profile-{part}.png)"]
             parts += ["Share of the runs above a score, its mean over the data sets of the aggregates above."]
     if report.has_figure:

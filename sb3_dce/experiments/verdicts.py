@@ -446,12 +446,17 @@ def _leading(evidence: Evidence) -> list[Verdict]:
         # the paper's own data if they are all there; never some of these and some of ours
         ids = by_source["D4RL"] if len(by_source["D4RL"]) >= len(by_source["sb3"]) else by_source["sb3"]
         scores = {name: {v.name: evidence.last(v, name) for v in agents} for name in ids}
-        means = {name: {agent: float(s.mean()) for agent, s in of.items() if len(s)} for name, of in scores.items()}
+        whole = {name: [v.name for v in agents if not evidence.n_diverged(v, name)] for name in ids}
+        means = {
+            name: {agent: float(s.mean()) for agent, s in of.items() if len(s) and agent in whole[name]}
+            for name, of in scores.items()
+        }
+        ended = {name: {v.name: len(scores[name][v.name]) or evidence.n_diverged(v, name) for v in agents} for name in ids}
         places = {
             name: 1 + sum(mean > of.get("DCE", -math.inf) for agent, mean in of.items() if agent != "DCE")
             for name, of in means.items()
         }
-        complete = all(len(s) for of in scores.values() for s in of.values())
+        complete = all(n for of in ended.values() for n in of.values())
         one_length = len({evidence.n_updates(name) for name in ids}) == 1
         everything = bool(wanted) and len(ids) == len(wanted) and complete and one_length
         holds: bool | str | None
@@ -474,7 +479,7 @@ def _leading(evidence: Evidence) -> list[Verdict]:
                 "the sets an agent is clearly above it, or it diverged"
             )
         rule += "; the 5 % of the test are divided among all comparisons of the claim"
-        missing = [name for of in scores.values() for name, s in of.items() if not len(s)]
+        missing = [name for of in ended.values() for name, n in of.items() if not n]
         absent = [f"{name} on {missing.count(name)} of {len(ids)} sets" for name in sorted(set(missing))]
         numbers = ", ".join(f"{name}: {place} ({evidence.scope(name, agents)})" for name, place in places.items())
         numbers = f"place of DCE: {numbers or '-'}" + (f"; without runs of this length: {', '.join(absent)}" if absent else "")
@@ -513,6 +518,10 @@ def _is_of_kind(paper: str, task: str, endings: tuple[str, ...]) -> bool:
     return paper.startswith(task) and paper.removesuffix("-v2").partition("-")[2] in endings
 
 
+def _mean_of(scores: np.ndarray) -> str:
+    return f"{scores.mean():.1f}" if len(scores) else "diverged"
+
+
 # Of each form, where scores spread as on Adroit's human data.
 FEWEST_SEEDS = 3
 
@@ -527,10 +536,11 @@ def _adroit(evidence: Evidence) -> list[Verdict]:
         scores = [evidence.last(v, name) for v in (with_, without)]
         same_kind = not dataset.is_other_kind(name)
         human = dataset.paper in (without.datasets or ()) and same_kind
-        if human and all(map(len, scores)):
+        n_runs = [evidence.runs(v, name)["seed"].nunique() for v in (with_, without)]
+        if human and all(n_runs):
             pairs[name] = (scores[0], scores[1])
             lost = [evidence.n_diverged(v, name) > 0 for v in (with_, without)]
-            if any(lost):  # what diverges on a seed has failed
+            if min(n_runs) >= FEWEST_SEEDS and any(lost):  # what diverges on a seed has failed
                 ups += [lost[1]] if lost[0] != lost[1] else []
             elif min(map(len, scores)) >= FEWEST_SEEDS:
                 spread = [uncertainty(evidence, v, name) for v in (with_, without)]
@@ -538,7 +548,7 @@ def _adroit(evidence: Evidence) -> list[Verdict]:
         if same_kind and len(scores[0]) > 1 and not isinstance(row_of(with_.algo, name)["ent_coef"], str):
             wide[name] = scores[0]
     numbers = ", ".join(
-        f"{name}: {a.mean():.1f} with, {b.mean():.1f} without ({evidence.scope(name, [with_, without])})"
+        f"{name}: {_mean_of(a)} with, {_mean_of(b)} without ({evidence.scope(name, [with_, without])})"
         for name, (a, b) in pairs.items()
     )
     holds = None if not ups else False if False in ups else True in ups or CLOSE
@@ -552,7 +562,7 @@ def _adroit(evidence: Evidence) -> list[Verdict]:
     spreads = Values((name, sample_std(scores)) for name, scores in wide.items())
     spreads.scope = lengths_and_seeds(evidence, with_, list(spreads))
     large = spreads_beyond(wide, 15.0)
-    if large is not True and not any(name.startswith("pen-human") for name in spreads):
+    if large is not True and not any(name.startswith("pen-human") for name, s in wide.items() if len(s) >= PAPER_SEEDS):
         large = None  # on the other sets the paper's own deviations are below 15
     rule = (
         f"of the sets with a constant alpha and {PAPER_SEEDS} seeds or more, on some the 95 % interval of the standard "
