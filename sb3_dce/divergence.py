@@ -6,6 +6,7 @@ is not finite has spread to all others. So the updates since the last look are m
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -100,7 +101,7 @@ def not_finite(metrics: dict[str, float]) -> list[str]:
     :param metrics: values by name
     :return: names of those that are NaN or infinite
     """
-    return [name for name, value in metrics.items() if value != value or value in (float("inf"), float("-inf"))]
+    return [name for name, value in metrics.items() if not math.isfinite(value)]
 
 
 def locate(model: OfflineAlgorithm, rewind: Rewind | None, names: list[str], first: int) -> DivergenceError:

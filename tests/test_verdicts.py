@@ -12,7 +12,7 @@ from result_rows import run_rows, table_rows
 from sb3_dce.experiments import results
 from sb3_dce.experiments.claims import claim_table
 from sb3_dce.experiments.evidence import Evidence
-from sb3_dce.experiments.grid import Experiment, load_experiment
+from sb3_dce.experiments.grid import load_experiment
 from sb3_dce.experiments.judging import CLOSE, HELD, NOT_HELD, UNTESTED, uncertainty
 from sb3_dce.experiments.reports import reproduction
 from sb3_dce.experiments.verdicts import verdicts
@@ -211,28 +211,21 @@ def test_best_on_every_set_is_not_best_on_one() -> None:
     assert one_of(outcomes("table1", rows), "C4") == NOT_HELD
 
 
-def steady_rows(table: Experiment, data: str) -> pd.DataFrame:
-    return results.merge(run_rows(table, "DCE", data, s, 40.0 + s) for s in range(5))
-
-
 def test_claim_on_seeds() -> None:
-    table = load_experiment("table1")
-    hopper = "hopper-medium-sb3"
-    for spread, expected in ((30.0, HELD), (1.0, NOT_HELD)):
-        rows = results.merge(run_rows(table, "DCE", hopper, s, 40.0 + s * spread) for s in range(5))
-        lines = {row[0]: row[2] for row in claim_table({"table1": Evidence(table, rows, table.scales["cpu"])}, {}).rows}
-        assert lines["C7"] == expected
-    steady = steady_rows(table, CHEETAH)
-    mixed = results.merge(
-        [steady_rows(table, CHEETAH), *(run_rows(table, "DCE", hopper, s, 40.0 + 30.0 * s) for s in range(2))]
-    )
-    lines = {row[0]: row[2] for row in claim_table({"table1": Evidence(table, mixed, table.scales["cpu"])}, {}).rows}
-    assert lines["C7"] == UNTESTED, "two seeds of Hopper"
-    few = results.merge(run_rows(table, "DCE", hopper, s, 40.0 + 30.0 * s) for s in range(4))
-    lines = {row[0]: row[2] for row in claim_table({"table1": Evidence(table, few, table.scales["cpu"])}, {}).rows}
-    assert lines["C7"] == UNTESTED, "four seeds say little on a deviation"
-    lines = {row[0]: row[2] for row in claim_table({"table1": Evidence(table, steady, table.scales["cpu"])}, {}).rows}
-    assert lines["C7"] == UNTESTED, "the claim is about Hopper and people's demonstrations"
+    table, hopper = load_experiment("table1"), "hopper-medium-sb3"
+
+    def runs(data: str, spread: float, n_seeds: int) -> list[pd.DataFrame]:
+        return [run_rows(table, "DCE", data, seed, 40.0 + seed * spread) for seed in range(n_seeds)]
+
+    def outcome(rows: list[pd.DataFrame]) -> str:
+        evidence = Evidence(table, results.merge(rows), table.scales["cpu"])
+        return {row[0]: row[2] for row in claim_table({"table1": evidence}, {}).rows}["C7"]
+
+    assert outcome(runs(hopper, 30.0, 5)) == HELD
+    assert outcome(runs(hopper, 1.0, 5)) == NOT_HELD
+    assert outcome([*runs(CHEETAH, 1.0, 5), *runs(hopper, 30.0, 2)]) == UNTESTED, "two seeds of Hopper"
+    assert outcome(runs(hopper, 30.0, 4)) == UNTESTED, "four seeds say little on a deviation"
+    assert outcome(runs(CHEETAH, 1.0, 5)) == UNTESTED, "the claim is about Hopper and people's demonstrations"
 
 
 def test_a_score_within_the_papers_deviation_is_reproduced() -> None:

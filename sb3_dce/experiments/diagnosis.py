@@ -90,14 +90,13 @@ def verdict_of(evidence: Evidence, dataset_id: str) -> str:
     """
     experiment = evidence.experiment
     scores = {v.name: score_of(evidence, v, dataset_id) for v in experiment.variants}
-    dce = scores["DCE"]
+    variant, dce = experiment.variant("DCE"), scores["DCE"]
     rivals = {name: score for name in RIVALS if (score := scores[name]) is not None}
-    if n_lost := evidence.n_diverged(experiment.variant("DCE"), dataset_id):
-        return f"DCE diverged on {n_lost} of {evidence.runs(experiment.variant('DCE'), dataset_id)['seed'].nunique()} seeds"
+    if n_lost := evidence.n_diverged(variant, dataset_id):
+        return f"DCE diverged on {n_lost} of {evidence.runs(variant, dataset_id)['seed'].nunique()} seeds"
     if dce is None or not rivals:
         return "not tested"
     best = max(rivals, key=rivals.__getitem__)
-    variant = experiment.variant("DCE")
     own = uncertainty(evidence, variant, dataset_id)
     gap = rivals[best] - dce
     if gap <= 0:

@@ -298,6 +298,14 @@ class Evidence:
         rows = self.runs(variant, dataset_id)
         return int((rows["metric"] == "diverged").sum())
 
+    def has_ended(self, variant: Variant, dataset_id: str) -> bool:
+        """
+        :param variant: of the experiment
+        :param dataset_id: data
+        :return: whether there are runs with a score, or that diverged; without a simulator a run has neither
+        """
+        return len(self.last(variant, dataset_id)) > 0 or self.n_diverged(variant, dataset_id) > 0
+
     def curve(self, variant: Variant, dataset_id: str, metric: str) -> pd.DataFrame:
         """
         :param variant: of the experiment

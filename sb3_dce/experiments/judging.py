@@ -178,19 +178,20 @@ def differs(difference: float, one: Uncertainty, other: Uncertainty, n_tests: in
     return CLOSE if abs(difference) <= student_quantile(freedom, 1.0 - 0.05 / n_tests) * error else difference > 0
 
 
-def spreads_beyond(spreads: Mapping[str, np.ndarray], limit: float) -> bool | str | None:
+def spreads_beyond(spreads: Mapping[str, np.ndarray], limit: float, *named: str) -> bool | str | None:
     """
     :param spreads: scores by data, one per seed
     :param limit: of their standard deviation
+    :param named: beginnings of the data on which the paper has it; without any of these nothing is said against it
     :return: whether it is above on some data, false if it is below on all, by its 95 % interval, divided among the data;
-        ``None`` without data with as many seeds as the paper's
+        ``None`` without the data that are needed, with as many seeds as the paper's
     """
-    known = [scores for scores in spreads.values() if len(scores) >= PAPER_SEEDS]
-    if not known:
-        return None
-    intervals = [sample_std(s) * np.array(std_factors(len(s), 1.0 - 0.05 / len(known))) for s in known]
+    known = {name: scores for name, scores in spreads.items() if len(scores) >= PAPER_SEEDS}
+    intervals = [sample_std(s) * np.array(std_factors(len(s), 1.0 - 0.05 / len(known))) for s in known.values()]
     if any(low > limit for low, _ in intervals):
         return True
+    if not any(name.startswith(named) for name in known):
+        return None
     return False if all(high < limit for _, high in intervals) else CLOSE
 
 

@@ -111,7 +111,7 @@ def import_runs(folder: Path, experiment: str, planned: Iterable[PlannedRun] = (
     :param planned: runs of grids, which are taken for these
     :return: rows of all complete runs below
     """
-    of_plan = {Path(run.spec.folder): run.experiment for run in sorted(planned, key=lambda run: run.experiment != TIMING)}
+    of_plan = _experiments(planned)
     folders = [path.parent for path in sorted(folder.rglob("config.yml"))]
     found = [rows_of_run(path, of_plan.get(path, experiment)) for path in folders]
     return merge(rows for rows in found if rows is not None)
@@ -122,10 +122,14 @@ def planned_rows(planned: Iterable[PlannedRun]) -> pd.DataFrame:
     :param planned: runs of a grid
     :return: rows of those that are complete, each run once
     """
-    # a run of two experiments is one of scores, not of times alone
-    by_folder = {run.spec.folder: run.experiment for run in sorted(planned, key=lambda run: run.experiment != TIMING)}
-    found = [rows_of_run(Path(folder), experiment) for folder, experiment in by_folder.items()]
+    found = [rows_of_run(folder, experiment) for folder, experiment in _experiments(planned).items()]
     return merge(rows for rows in found if rows is not None)
+
+
+def _experiments(planned: Iterable[PlannedRun]) -> dict[Path, str]:
+    """By folder; a run of two experiments is one of scores, not of times alone."""
+    last_counts = sorted(planned, key=lambda run: run.experiment != TIMING)
+    return {Path(run.spec.folder): run.experiment for run in last_counts}
 
 
 def merge(parts: Iterable[pd.DataFrame]) -> pd.DataFrame:

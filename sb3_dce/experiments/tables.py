@@ -156,9 +156,9 @@ def common_rows(evidence: Evidence, part: str) -> list[str]:
     """
     ids = _rows_of_part(evidence, part)
     papers = [v for v in evidence.experiment.variants if v.paper is not None]
-    counts = [sum(_has_ended(evidence, v, name) for name in ids) for v in papers]
+    counts = [sum(evidence.has_ended(v, name) for name in ids) for v in papers]
     variants = [v for v, count in zip(papers, counts, strict=True) if count and 2 * count >= max(counts)]
-    ids = [name for name in ids if variants and all(_has_ended(evidence, v, name) for v in variants)]
+    ids = [name for name in ids if variants and all(evidence.has_ended(v, name) for v in variants)]
     lengths = [evidence.n_updates(name) or 0 for name in ids]
     usual = max(lengths, key=lambda n: (lengths.count(n), n), default=0)
     return [name for name, length in zip(ids, lengths, strict=True) if length == usual]
@@ -174,15 +174,10 @@ def compared(evidence: Evidence, ids: list[str]) -> list[Variant]:
     found = []
     for variant in evidence.experiment.variants:
         runs = [evidence.key_of(variant, name) for name in ids]
-        if variant.datasets is None and runs not in hashes and all(_has_ended(evidence, variant, name) for name in ids):
+        if variant.datasets is None and runs not in hashes and all(evidence.has_ended(variant, name) for name in ids):
             hashes.append(runs)
             found.append(variant)
     return found
-
-
-def _has_ended(evidence: Evidence, variant: Variant, dataset_id: str) -> bool:
-    """With a score or by diverging; without a simulator a run has neither."""
-    return len(evidence.last(variant, dataset_id)) > 0 or evidence.n_diverged(variant, dataset_id) > 0
 
 
 def n_diverged(evidence: Evidence, variant: Variant, ids: list[str]) -> int:

@@ -446,19 +446,17 @@ def _leading(evidence: Evidence) -> list[Verdict]:
         # the paper's own data if they are all there; never some of these and some of ours
         ids = by_source["D4RL"] if len(by_source["D4RL"]) >= len(by_source["sb3"]) else by_source["sb3"]
         scores = {name: {v.name: evidence.last(v, name) for v in agents} for name in ids}
-        whole = {name: [v.name for v in agents if not evidence.n_diverged(v, name)] for name in ids}
-        means = {
-            name: {agent: float(s.mean()) for agent, s in of.items() if len(s) and agent in whole[name]}
-            for name, of in scores.items()
+        whole = {
+            name: [v.name for v in agents if len(evidence.last(v, name)) and not evidence.n_diverged(v, name)] for name in ids
         }
-        ended = {name: {v.name: len(scores[name][v.name]) or evidence.n_diverged(v, name) for v in agents} for name in ids}
+        means = {name: {agent: float(scores[name][agent].mean()) for agent in whole[name]} for name in ids}
         places = {
             name: 1 + sum(mean > of.get("DCE", -math.inf) for agent, mean in of.items() if agent != "DCE")
             for name, of in means.items()
         }
-        complete = all(n for of in ended.values() for n in of.values())
+        missing = [v.name for name in ids for v in agents if not evidence.has_ended(v, name)]
         one_length = len({evidence.n_updates(name) for name in ids}) == 1
-        everything = bool(wanted) and len(ids) == len(wanted) and complete and one_length
+        everything = bool(wanted) and len(ids) == len(wanted) and not missing and one_length
         holds: bool | str | None
         n_tests = max(1, sum(len(evidence.runs(v, name)) > 0 for v in agents if v is not dce for name in ids))
         if claim.startswith("C6"):
@@ -479,7 +477,6 @@ def _leading(evidence: Evidence) -> list[Verdict]:
                 "the sets an agent is clearly above it, or it diverged"
             )
         rule += "; the 5 % of the test are divided among all comparisons of the claim"
-        missing = [name for of in ended.values() for name, n in of.items() if not n]
         absent = [f"{name} on {missing.count(name)} of {len(ids)} sets" for name in sorted(set(missing))]
         numbers = ", ".join(f"{name}: {place} ({evidence.scope(name, agents)})" for name, place in places.items())
         numbers = f"place of DCE: {numbers or '-'}" + (f"; without runs of this length: {', '.join(absent)}" if absent else "")
@@ -561,9 +558,7 @@ def _adroit(evidence: Evidence) -> list[Verdict]:
     wide = {name: scores for name, scores in wide.items() if source_of(name) == min(sources)}  # "D4RL" before "sb3"
     spreads = Values((name, sample_std(scores)) for name, scores in wide.items())
     spreads.scope = lengths_and_seeds(evidence, with_, list(spreads))
-    large = spreads_beyond(wide, 15.0)
-    if large is not True and not any(name.startswith("pen-human") for name, s in wide.items() if len(s) >= PAPER_SEEDS):
-        large = None  # on the other sets the paper's own deviations are below 15
+    large = spreads_beyond(wide, 15.0, "pen-human")  # on the other sets the paper's own deviations are below 15
     rule = (
         f"of the sets with a constant alpha and {PAPER_SEEDS} seeds or more, on some the 95 % interval of the standard "
         "deviation over seeds (chi-square, divided among the sets) is above 15 (paper: 37 on pen-human); did not hold: "
