@@ -11,6 +11,7 @@ from commands import sb3_dce
 from result_rows import SHA, run_rows, table_rows
 
 from sb3_dce.experiments import results
+from sb3_dce.experiments.captions import caption
 from sb3_dce.experiments.claims import claim_table, own_table_facts
 from sb3_dce.experiments.curves import panel_curves
 from sb3_dce.experiments.diagnosis import variant_table
@@ -244,16 +245,34 @@ def test_adroit_and_kitchen_have_totals_of_their_own() -> None:
 
 
 def test_captions_name_data_hash_length_seeds_and_code() -> None:
-    caption = evidence_of(table_rows(TABLE, {CHEETAH: scores()})).caption([CHEETAH])
+    text = caption(evidence_of(table_rows(TABLE, {CHEETAH: scores()})), [CHEETAH])
     for part in (
-        f"`{CHEETAH}` (made with this package, not D4RL's; sha256 {SHA[:8]}…; cpu)",
+        f"`{CHEETAH}` {SHA[:8]}…, made with this package, not D4RL's (run on cpu)",
         "Gradient steps: 1,000",
         "seeds: 3",
     ):
-        assert part in caption
-    assert "10 episodes" in caption and "0.1.0+0123456789" in caption
-    d4rl = evidence_of(table_rows(TABLE, {"hopper-medium-v2": scores()})).caption(["hopper-medium-v2"])
-    assert "`hopper-medium-v2` (D4RL; sha256" in d4rl
+        assert part in text
+    assert "10 episodes" in text and "0.1.0 (commit 0123456)" in text
+    d4rl = caption(evidence_of(table_rows(TABLE, {"hopper-medium-v2": scores()})), ["hopper-medium-v2"])
+    assert f"`hopper-medium-v2` {SHA[:8]}…, of D4RL" in d4rl
+
+
+def test_a_panel_is_as_long_as_its_own_lines(tmp_path: Path) -> None:
+    experiment = load_experiment("fig-beta")
+    long = [run_rows(experiment, f"beta {b}", CHEETAH, 0, curves={"q_data": [1.0] * 4}, n_updates=200) for b in (0, 2, 4, 8)]
+    short = [
+        run_rows(experiment, variant.name, CHEETAH, 0, curves={"score": [1.0] * 4, "q_data": [1.0] * 4}, n_updates=100)
+        for variant in experiment.variants
+    ]
+    evidence = evidence_of(results.merge([*long, *short]), "fig-beta")
+    ends = {
+        panel.metric: max(c.index[-1] for c, _ in panel_curves(evidence, panel).values()) for panel in experiment.panels[:2]
+    }
+    assert ends == {"score": 100, "q_data": 200}, "BC has no runs of the length that the betas have"
+    text = make_report(evidence).caption
+    assert "Gradient steps: 100 to 200;" in text and "Further runs" not in text, "both are drawn"
+    only = caption(evidence, [CHEETAH], [experiment.variant("beta 2"), experiment.variant("BC")])
+    assert f"Further runs, of other lengths: 1 of 200 steps on {CHEETAH}." in only
 
 
 def test_markdown_latex_and_csv_have_the_same_cells() -> None:
@@ -542,7 +561,7 @@ def test_report_from_rows_alone_is_the_same_every_time(tmp_path: Path) -> None:
         p.name for p in first
     }
     page = (tmp_path / "a" / "results.md").read_text()
-    assert "![Ablation of beta](figures/fig-beta.png)" in page and "sha256 abababab…" in page
+    assert "![Ablation of beta](figures/fig-beta.png)" in page and f"`{CHEETAH}` abababab…" in page
     assert "## The paper's claims" in page and "**held**" in page and "**could not be tested**" in page
     assert not (tmp_path / "a" / "runs").exists(), "nothing is trained"
 

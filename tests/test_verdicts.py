@@ -279,6 +279,20 @@ def test_level_of_q_is_judged_when_it_is_reached(n_updates: int, outcome: str) -
     assert one_of(found, "far lower (paper: 4000 and 400), alpha auto") == outcome
 
 
+def test_a_claim_is_about_runs_as_long_as_those_of_its_own_agents() -> None:
+    betas = (0, 2, 4, 8)
+    long = scored("fig-beta", {CHEETAH: {f"beta {b}": 10.0 - b for b in betas}}, "q_data", n_updates=200_000)
+    experiment = load_experiment("fig-beta")
+    values = {v.name: 50.0 for v in experiment.variants} | {f"beta {b}": 10.0 + b for b in betas}
+    short = [
+        run_rows(experiment, name, CHEETAH, 0, curves={"q_data": [value] * 10, "score": [value] * 10}, n_updates=50_000)
+        for name, value in values.items()
+    ]
+    found = outcomes("fig-beta", results.merge([long, *short]))
+    assert one_of(found, "In-data Q falls") == HELD, "the longer runs count, though most agents have shorter ones"
+    assert one_of(found, "below BC") == HELD, "and BC is compared at the length it has"
+
+
 def test_borrowed_deviation_is_no_second_estimate() -> None:
     experiment = load_experiment("fig-cql-return")
 
@@ -297,7 +311,7 @@ def test_single_runs_spread_on_each_data_set_as_the_papers_dce() -> None:
     table = load_experiment("table1")
     hopper = {"hopper-medium-sb3": {"DCE": [40.0], "BC": [60.0]}, CHEETAH: {"DCE": [40.0], "BC": [60.0]}}
     evidence = Evidence(table, table_rows(table, hopper), table.scales["cpu"])
-    assert [uncertainty(evidence, table.variant("DCE"), name).error for name in hopper] == [12.3, 4.2]
+    assert [uncertainty(evidence, evidence.last(table.variant("DCE"), name), name).error for name in hopper] == [12.3, 4.2]
 
 
 def test_first_by_a_hair_is_not_best() -> None:
@@ -313,7 +327,7 @@ def test_few_seeds_are_taken_to_spread_as_much_as_any_agent_on_the_data() -> Non
 
     def errors(**scores: list[float]) -> list[float]:
         evidence = Evidence(table, table_rows(table, {CHEETAH: scores}), table.scales["cpu"])
-        return [uncertainty(evidence, table.variant(name), CHEETAH).error for name in scores]
+        return [uncertainty(evidence, evidence.last(table.variant(name), CHEETAH), CHEETAH).error for name in scores]
 
     assert errors(DCE=[10.0, 70.0]) == [pytest.approx(30.0)]
     assert errors(DCE=[40.0, 40.0]) == [pytest.approx(4.2 / np.sqrt(2))]

@@ -18,12 +18,22 @@ def variants_of(evidence: Evidence, panel: Panel) -> tuple[str, ...]:
     return panel.variants or tuple(v.name for v in evidence.experiment.variants)
 
 
+def view_of(evidence: Evidence, panel: Panel) -> Evidence:
+    """
+    :param evidence: rows
+    :param panel: picture
+    :return: rows of its variants alone, which may have longer runs than all of the figure
+    """
+    return evidence.among([*variants_of(evidence, panel), *([panel.reference] if panel.reference else [])])
+
+
 def panel_curves(evidence: Evidence, panel: Panel) -> dict[str, tuple[pd.DataFrame, pd.Series | None]]:
     """
     :param evidence: rows
     :param panel: picture
     :return: by line its curves (steps by seeds) and, where there is one, what theory expects; lines without data are left out
     """
+    evidence = view_of(evidence, panel)
     experiment = evidence.experiment
     names = variants_of(evidence, panel)
     curves: dict[str, tuple[pd.DataFrame, pd.Series | None]] = {}

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from sb3_dce.experiments.captions import caption
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import Variant
-from sb3_dce.experiments.judging import CLEARLY, CLOSE, differs, uncertainty
+from sb3_dce.experiments.judging import CLEARLY, CLOSE, Uncertainty, differs, uncertainty
 from sb3_dce.experiments.text_table import TextTable
 
 # A change counts as a cause if it closes this share of the distance to the better of BC and IQL.
@@ -53,7 +54,7 @@ def variant_table(evidence: Evidence) -> TextTable:
         "rounding alone and is not counted. Rising and falling are the same share between the middle and the end of the run; "
         "the survival condition is that the mean reward exceeds beta_eff."
     )
-    return TextTable(header, tuple(rows), f"{evidence.caption([n for _, n in evidence.table_rows()])} {note}")
+    return TextTable(header, tuple(rows), f"{caption(evidence, [n for _, n in evidence.table_rows()])} {note}")
 
 
 def diagnostics_table(evidence: Evidence) -> TextTable:
@@ -79,7 +80,7 @@ def diagnostics_table(evidence: Evidence) -> TextTable:
         "Diagnostics of DCE with the paper's row; means over the last tenth of the run where nothing else is said. The "
         "survival margin is the mean reward less beta_eff: below 0, with terminals, ending an episode pays."
     )
-    return TextTable(header, tuple(rows), f"{evidence.caption([n for _, n in evidence.table_rows()], [dce])} {note}")
+    return TextTable(header, tuple(rows), f"{caption(evidence, [n for _, n in evidence.table_rows()], [dce])} {note}")
 
 
 def verdict_of(evidence: Evidence, dataset_id: str) -> str:
@@ -97,11 +98,15 @@ def verdict_of(evidence: Evidence, dataset_id: str) -> str:
     if dce is None or not rivals:
         return "not tested"
     best = max(rivals, key=rivals.__getitem__)
-    own = uncertainty(evidence, variant, dataset_id)
+
+    def uncertain(of: Variant) -> Uncertainty:
+        return uncertainty(evidence, evidence.last(of, dataset_id), dataset_id)
+
+    own = uncertain(variant)
     gap = rivals[best] - dce
     if gap <= 0:
         return f"not behind ({best} {rivals[best]:.1f})"
-    close = differs(gap, uncertainty(evidence, experiment.variant(best), dataset_id), own) == CLOSE
+    close = differs(gap, uncertain(experiment.variant(best)), own) == CLOSE
     causes, excluded = [], []
     margin = lowest_margin(evidence, variant, dataset_id)
     if (evidence.start(variant, dataset_id, "data_n_terminals") or 0) > 0 and margin is not None:
@@ -116,7 +121,7 @@ def verdict_of(evidence: Evidence, dataset_id: str) -> str:
         name, score = v.name, changed.get(v.name)
         if score is None or score - dce < SHARE * gap:
             continue
-        if differs(score - dce, uncertainty(evidence, v, dataset_id), own) is True:
+        if differs(score - dce, uncertain(v), own) is True:
             causes.append(f"{name} closes {(score - dce) / gap:.0%}")
     half, end = halves(evidence, variant, dataset_id)
     if half is not None and end is not None and abs(end - half) >= SHARE * gap:

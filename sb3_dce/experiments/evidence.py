@@ -3,14 +3,16 @@ What the rows say about an experiment: scores of a table's cells, curves of a fi
 
 All cells of a table row come from one file: where rows of two versions of a dataset are known, those of the file that is here
 are taken, else of the one with more runs, and the others are counted as left out. All have one length; runs of an agent that
-has only others are shown as what they are (:meth:`Evidence.of_other_length`) and take part in no comparison. A configuration
-without runs is shown with those of another that is the same agent over their length: two schedules of beta part later.
+has only others are shown as what they are (:meth:`Evidence.of_other_length`) and take part in no comparison. A panel and a
+claim about some of the variants have the length that these have (:meth:`Evidence.among`). A configuration without runs is
+shown with those of another that is the same agent over their length: two schedules of beta part later.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -27,7 +29,6 @@ from sb3_dce.experiments.grid import (
     Variant,
     agent_key,
     settings_in_force,
-    source_of,
     variant_hash,
 )
 from sb3_dce.experiments.results import TIMING
@@ -35,6 +36,7 @@ from sb3_dce.theory import beta_eff, shift_factor, value_shift_factor
 
 UPDATES_PER_EPOCH = 1000
 TAIL = 0.1  # share of a run, from its end, that stands for what it has become
+RUN_COLUMNS = ["dataset", "dataset_sha256", "agent", "config_hash", "n_updates", "seed"]
 GAMMA, TAU = 0.99, 0.005  # of all DCE runs of the figures (paper, common configuration)
 
 
@@ -45,7 +47,8 @@ class Evidence:
     :param experiment: with its datasets and variants
     :param rows: any rows; those of other experiments count where the run is the same
     :param scale: may change settings of agents, and so decides which configurations are shown
-    :param n_updates: only runs of this length; ``None`` takes for each dataset the length most of its variants have
+    :param n_updates: only runs of this length; ``None`` takes for each dataset the length most of its variants have, the
+        longest of these
     :param hash_here: gives the SHA-256 of a dataset's file on this machine, ``None`` without one
     """
 
@@ -64,8 +67,24 @@ class Evidence:
         self._selected: dict[str, pd.DataFrame] = {}
         self._others: dict[str, pd.DataFrame] = {}
         self._runs: dict[tuple[str, str], pd.DataFrame] = {}
+        self._views: dict[tuple[str, ...], Evidence] = {}
+        self._again: dict[tuple[str, str], list[pd.DataFrame]] = {}
         self.left_out = 0
-        self.of_other_lengths: dict[str, dict[int, int]] = {}
+
+    def among(self, names: Iterable[str]) -> Evidence:
+        """
+        :param names: of variants
+        :return: the same rows for these variants alone: those of a figure's panel may have longer runs than all of the figure
+        """
+        variants = tuple(v for v in self.experiment.variants if v.name in set(names))
+        key = tuple(v.name for v in variants)
+        if key not in self._views:
+            experiment = replace(self.experiment, variants=variants)
+            view = Evidence(experiment, self._rows, self.scale, self._n_updates, self._hash_here)
+            view._again = self._again
+            view.__dict__["_groups"] = self._groups  # to group all rows takes longer than all else
+            self._views[key] = view
+        return self._views[key]
 
     # -- which data ------------------------------------------------------------------------------------------------
 
@@ -139,7 +158,7 @@ class Evidence:
         seeds = sorted({self.runs(v, dataset_id)["seed"].nunique() for v in shown}) or [0]
         lost = [f"{v.name}: {n} diverged" for v in shown if (n := self.n_diverged(v, dataset_id))]
         word = "seed" if seeds[-1] == 1 else "seeds"
-        return "; ".join([f"{dataset_id}, {self.n_updates(dataset_id) or 0:,} steps, {_listed(seeds)} {word}", *lost])
+        return "; ".join([f"{dataset_id}, {self.n_updates(dataset_id) or 0:,} steps, {span(seeds)} {word}", *lost])
 
     # -- which runs ------------------------------------------------------------------------------------------------
 
@@ -151,10 +170,7 @@ class Evidence:
         parts = [self._groups[key] for key in sorted(keys) if key in self._groups]
         again = [part for variant in keys.values() for part in self._of_the_same_agent(variant, dataset_id)]
         found = pd.concat([*parts, *again]) if parts or again else self._rows.iloc[:0]
-        runs, once = (
-            rows[["dataset_sha256", "agent", "config_hash", "n_updates", "seed"]].drop_duplicates()
-            for rows in (found, pd.concat(parts) if parts else found.iloc[:0])
-        )
+        runs, once = (runs_in(rows) for rows in (found, pd.concat(parts) if parts else found.iloc[:0]))
         if len(runs):
             sha = _commonest(runs["dataset_sha256"])
             if (runs["dataset_sha256"] != sha).any():
@@ -169,8 +185,6 @@ class Evidence:
             taken = (found["dataset_sha256"] == sha) & (found["n_updates"] == length)
             self.left_out += int((once["dataset_sha256"] != sha).sum())
             self._others[dataset_id] = found[(found["dataset_sha256"] == sha) & ~taken]
-            other = once[(once["dataset_sha256"] == sha) & (once["n_updates"] != length)]["n_updates"].value_counts()
-            self.of_other_lengths[dataset_id] = {int(n): int(k) for n, k in other.items()}  # type: ignore[call-overload]
             found = found[taken]
         self._selected[dataset_id] = found
         return found
@@ -180,6 +194,8 @@ class Evidence:
         Where a variant has no runs of a length: those of another configuration that is the same agent over this length, under
         its hash. Of several the one with the most seeds: runs of two precisions are not put together.
         """
+        if (variant.name, dataset_id) in self._again:
+            return self._again[variant.name, dataset_id]
         wanted, settings = variant_hash(variant, dataset_id, self.scale), settings_in_force(variant, dataset_id, self.scale)
         own = self._groups.get((dataset_id, variant.algo, wanted), self._rows.iloc[:0])
         known = set(own[["dataset_sha256", "n_updates"]].itertuples(index=False, name=None))
@@ -197,7 +213,8 @@ class Evidence:
                 part = rows[(rows["dataset_sha256"] == sha) & (rows["n_updates"] == n_updates)].assign(config_hash=wanted)
                 if key not in found or part["seed"].nunique() > found[key]["seed"].nunique():
                     found[key] = part
-        return list(found.values())
+        self._again[variant.name, dataset_id] = list(found.values())
+        return self._again[variant.name, dataset_id]
 
     def key_of(self, variant: Variant, dataset_id: str) -> str:
         """
@@ -371,48 +388,35 @@ class Evidence:
         settings = settings_in_force(variant, dataset_id, self.scale)
         return beta_eff(settings["beta"], settings["td_loss_coef"])
 
-    # -- captions --------------------------------------------------------------------------------------------------
+    # -- what is shown ---------------------------------------------------------------------------------------------
 
-    def caption(self, dataset_ids: Iterable[str], variants: Iterable[Variant] | None = None) -> str:
+    def shown(self, dataset_ids: Iterable[str], variants: Iterable[Variant]) -> pd.DataFrame:
         """
-        :param dataset_ids: data shown
-        :param variants: agents shown; ``None`` for all
-        :return: where the numbers come from: data with hash, length, seeds, code
+        :param dataset_ids: data
+        :param variants: agents
+        :return: rows of the runs that stand for them
         """
-        ids = list(dict.fromkeys(dataset_ids))
-        shown = list(self.experiment.variants if variants is None else variants)
-        parts = [part for name in ids for v in shown for part in (self.runs(v, name), self.of_other_length(v, name))]
-        rows = pd.concat([part for part in parts if len(part)]) if any(len(part) for part in parts) else self._rows.iloc[:0]
-        if rows.empty:
-            return "No data."
-        data = []
-        for name in ids:
-            of = rows[rows["dataset"] == name]
-            if len(hashes := of["dataset_sha256"].unique()):
-                source = "D4RL" if source_of(name) == "D4RL" else "made with this package, not D4RL's"
-                how = " and ".join(sorted(of["device"].unique()))
-                data.append(f"`{name}` ({source}; sha256 {', '.join(h[:8] for h in hashes)}…; {how})")
-        lengths = sorted(rows["n_updates"].unique())
-        seeds = rows.drop_duplicates(["dataset", "agent", "config_hash", "seed"])
-        counts = sorted(seeds.groupby(["dataset", "agent", "config_hash"], observed=True).size().unique())
-        episodes = sorted(rows[rows["metric"] == "n_episodes"]["value"].astype(int).unique())
-        small = "Smoke scale, a test of the machinery: numbers and verdicts say nothing about the agents. "
-        text = small if self.scale.source == "embedded" else ""
-        text += f"Data: {'; '.join(data)}. Gradient steps: {_listed(lengths)}; seeds: {_listed(counts)}; last policy"
-        text += f", {_listed(episodes)} episode{'' if episodes[-1] == 1 else 's'}" if episodes else ""
-        text += f". Code (version+commit): {', '.join(sorted(rows['code_version'].unique()))}."
-        ran = [v for v in shown if any(len(self.runs(v, n)) or len(self.of_other_length(v, n)) for n in ids)]
-        changed = {v.name: known for v in ran if (known := self._scale_settings(v))}
-        if changed and self.scale.source != "embedded":
-            text += " At this scale " + "; ".join(f"{name} has {settings}" for name, settings in changed.items()) + "."
-        hidden = [f"{k} of {n:,} steps on {name}" for name in ids for n, k in self.of_other_lengths.get(name, {}).items()]
-        if hidden:
-            text += f" Further runs, of other lengths: {'; '.join(hidden)}."
-        return text
+        cells = [(v, name) for name in dataset_ids for v in variants]
+        parts = [part for cell in cells for part in (self.runs(*cell), self.of_other_length(*cell))]
+        return pd.concat(parts) if parts else self._rows.iloc[:0]
 
-    def _scale_settings(self, variant: Variant) -> str:
-        settings = self.scale.set_for.get(variant.algo, {})
-        return ", ".join(f"{name}={value}" for name, value in settings.items() if name not in variant.set)
+    def every_run(self, dataset_id: str, variants: Iterable[Variant]) -> pd.DataFrame:
+        """
+        :param dataset_id: data
+        :param variants: agents
+        :return: one line per run of theirs, of any length and on any version of the file
+        """
+        keys = {(dataset_id, v.algo, variant_hash(v, dataset_id, self.scale)) for v in variants}
+        parts = [self._groups[key] for key in sorted(keys) if key in self._groups]
+        return runs_in(pd.concat(parts) if parts else self._rows.iloc[:0])
+
+
+def runs_in(rows: pd.DataFrame) -> pd.DataFrame:
+    """
+    :param rows: any
+    :return: one line per run
+    """
+    return rows[RUN_COLUMNS].drop_duplicates()
 
 
 def at_end(rows: pd.DataFrame, metric: str) -> np.ndarray:
@@ -440,6 +444,10 @@ def _commonest(values: pd.Series) -> str:
     return str(min(counts.index, key=lambda value: (-counts[value], value)))
 
 
-def _listed(numbers: Iterable[int]) -> str:
+def span(numbers: Iterable[int]) -> str:
+    """
+    :param numbers: in order
+    :return: the only one, or the first and the last
+    """
     found = [f"{int(n):,}" for n in numbers]
     return found[0] if len(found) == 1 else f"{found[0]} to {found[-1]}" if found else "-"

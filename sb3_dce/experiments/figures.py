@@ -10,7 +10,7 @@ import pandas as pd
 
 from sb3_dce.data.catalog import resolve
 from sb3_dce.errors import ConfigError
-from sb3_dce.experiments.curves import panel_curves, variants_of
+from sb3_dce.experiments.curves import panel_curves, variants_of, view_of
 from sb3_dce.experiments.evidence import UPDATES_PER_EPOCH, Evidence
 from sb3_dce.experiments.grid import Panel
 from sb3_dce.experiments.statistics import performance_profile
@@ -111,6 +111,7 @@ def _save(figure: Figure, folder: Path, name: str) -> list[Path]:
 def _panel(evidence: Evidence, panel: Panel, axes: Axes) -> None:
     curves = panel_curves(evidence, panel)
     colors = _colors(evidence, panel, list(curves))
+    evidence = view_of(evidence, panel)
     for number, (name, (curve, theory)) in enumerate(curves.items()):
         color, epochs = colors[name], np.asarray(curve.index) / UPDATES_PER_EPOCH
         if curve.shape[1] > 1:

@@ -113,35 +113,35 @@ def values_of(evidence: Evidence, names: list[str], metric: str, dataset: str | 
     :return: value of each variant at the end of its runs: mean of the last tenth, over seeds; of scores minus infinity if a
         run diverged, since then the agent has failed; ``None`` if one is missing
     """
-    dataset_id = evidence.id_of(dataset)
+    view = evidence.among(names)
+    dataset_id = view.id_of(dataset)
     if dataset_id is None:
         return None
     values = Values()
-    variants = [evidence.experiment.variant(name) for name in names]
+    variants = [view.experiment.variant(name) for name in names]
     for variant in variants:
-        value = evidence.tail(variant, dataset_id, metric)
-        if metric == "score" and evidence.n_diverged(variant, dataset_id):
+        value = view.tail(variant, dataset_id, metric)
+        if metric == "score" and view.n_diverged(variant, dataset_id):
             value = -math.inf
         if value is None:
             return None
         values[variant.name] = value
-        values.errors[variant.name] = uncertainty(evidence, variant, dataset_id)
-    values.scope = evidence.scope(dataset_id, variants)
-    values.other_kind = evidence.other_kind(dataset)
+        values.errors[variant.name] = uncertainty(evidence, view.last(variant, dataset_id), dataset_id)
+    values.scope = view.scope(dataset_id, variants)
+    values.other_kind = view.other_kind(dataset)
     return values
 
 
-def uncertainty(evidence: Evidence, variant: Variant, dataset_id: str) -> Uncertainty:
+def uncertainty(evidence: Evidence, own: np.ndarray, dataset_id: str) -> Uncertainty:
     """
-    :param evidence: rows
-    :param variant: agent
+    :param evidence: rows of the experiment
+    :param own: last scores of an agent, one per seed
     :param dataset_id: data
-    :return: of the mean of its last scores. One or two seeds say little on their spread: there it is the largest that is
-        known, see ``CLEARLY``
+    :return: of their mean. One or two seeds say little on their spread: there it is the largest that is known, see ``CLEARLY``
     """
-    n = max(1, len(evidence.last(variant, dataset_id)))
+    n = max(1, len(own))
     if n >= FEWEST_OWN:
-        return Uncertainty(sample_std(evidence.last(variant, dataset_id)) / math.sqrt(n), n - 1)
+        return Uncertainty(sample_std(own) / math.sqrt(n), n - 1)
     papers = {evidence.paper_id(dataset) for dataset, name in evidence.table_rows() if name == dataset_id}
     cells = [paper_score(paper, "DCE") for paper in papers]
     known = [cell.std for cell in cells if cell is not None and cell.std is not None]
@@ -232,16 +232,14 @@ def rising(values: Values | None) -> bool | None:
     return None if values is None else bool(np.all(np.diff(list(values.values())) > 0))
 
 
-def scoped(evidence: Evidence, names: list[str] | None = None) -> Values:
+def scoped(evidence: Evidence) -> Values:
     """
-    :param evidence: rows
-    :param names: of variants; ``None`` for all
+    :param evidence: rows of the variants concerned
     :return: no numbers yet, of the grid's first data
     """
     values, dataset_id = Values(), evidence.id_of(None)
     if dataset_id is not None:
-        variants = evidence.experiment.variants
-        values.scope = evidence.scope(dataset_id, [v for v in variants if names is None or v.name in names])
+        values.scope = evidence.scope(dataset_id, evidence.experiment.variants)
     return values
 
 

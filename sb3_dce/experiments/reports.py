@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from sb3_dce.configuration import row_of
 from sb3_dce.dce import OfflineDCE
 from sb3_dce.experiments import diagnosis, tables
-from sb3_dce.experiments.curves import panel_curves, variants_of
+from sb3_dce.experiments.captions import caption_of
+from sb3_dce.experiments.curves import panel_curves, variants_of, view_of
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import Variant, source_of
 from sb3_dce.experiments.judging import CLOSE, HELD, NOT_HELD, UNTESTED, Verdict, judge
@@ -56,7 +58,7 @@ def make_report(evidence: Evidence) -> Report:
     """
     kind = evidence.experiment.report
     drawn = drawn_in(evidence)
-    caption = evidence.caption(*drawn) if drawn is not None else ""
+    caption = caption_of(evidence, *drawn) if drawn is not None else ""
     found: dict[str, TextTable] = {}
     judged = verdicts(evidence)
     if kind == "table":
@@ -80,28 +82,26 @@ def make_report(evidence: Evidence) -> Report:
     return Report(found, drawn is not None, caption, judged)
 
 
-def drawn_in(evidence: Evidence) -> tuple[list[str], list[Variant]] | None:
+def drawn_in(evidence: Evidence) -> tuple[pd.DataFrame, list[Variant]] | None:
     """
     :param evidence: rows of one experiment
-    :return: data and variants of which there is a line in any panel, ``None`` if all panels are empty
+    :return: rows of the runs of which there is a line in any panel, and their variants; ``None`` if all panels are empty
     """
-    experiment = evidence.experiment
-    ids: set[str] = set()
+    parts: list[pd.DataFrame] = []
     names: set[str] = set()
-    for panel in experiment.panels:
-        curves = panel_curves(evidence, panel)
-        if panel.over:
-            ids.update(curves)
-        elif curves:
-            ids.update(name for name in [evidence.id_of(panel.dataset)] if name is not None)
-        if curves:
-            # lines of one variant (over data sets, or critics of the probe) have names of their own
-            names.update(variants_of(evidence, panel)[:1] if panel.over or panel.lines else curves)
-            names.update([panel.reference] if panel.reference else [])
-    if not ids:
+    for panel in evidence.experiment.panels:
+        curves, view = panel_curves(evidence, panel), view_of(evidence, panel)
+        if not curves:
+            continue
+        ids = list(curves) if panel.over else [name for name in [view.id_of(panel.dataset)] if name is not None]
+        # lines of one variant (over data sets, or critics of the probe) have names of their own
+        lines = {*(variants_of(view, panel)[:1] if panel.over or panel.lines else curves)}
+        lines |= {panel.reference} if panel.reference else set()
+        parts.append(view.shown(ids, [v for v in view.experiment.variants if v.name in lines]))
+        names |= lines
+    if not parts:
         return None
-    order = [name for _, name in evidence.table_rows() if name in ids]
-    return order, [v for v in experiment.variants if v.name in names]
+    return pd.concat(parts), [v for v in evidence.experiment.variants if v.name in names]
 
 
 def reproduction(evidence: Evidence) -> Verdict:

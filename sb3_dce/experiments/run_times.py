@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_dce.execution import UPDATES_WORTH_COMPILING
+from sb3_dce.experiments.captions import caption
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import Variant
 from sb3_dce.experiments.paper import MIXED_PROTOCOLS, paper_scores
@@ -43,7 +44,7 @@ def runtime_table(evidence: Evidence) -> TextTable:
         f"(bf16-matmul) and fewer draws make an agent faster than the paper's. {MIXED_PROTOCOLS}"
     )
     header = ("agent", "device and precision", "s per 1000 updates (median)", "range", "runs", "paper: s per 1000, RTX 3070")
-    return TextTable(header, tuple(rows), f"{evidence.caption(ids)} {note}")
+    return TextTable(header, tuple(rows), f"{caption(evidence, ids)} {note}")
 
 
 def has_fewer_draws(evidence: Evidence, variant: Variant) -> bool:

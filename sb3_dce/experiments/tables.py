@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sb3_dce.data.catalog import resolve
+from sb3_dce.experiments.captions import caption
 from sb3_dce.experiments.evidence import Evidence, at_end, curve_of
 from sb3_dce.experiments.grid import Variant, source_of
 from sb3_dce.experiments.paper import MIXED_PROTOCOLS, paper_score, paper_total
@@ -62,7 +63,7 @@ def score_table(evidence: Evidence) -> TextTable:
         "DCE has the paper's row of each dataset; the paper tuned these by evaluating online. 'One setting' has its commonest "
         "row everywhere; up to the first change of beta, after 50,000 steps, both are one agent where the row begins alike."
     )
-    return TextTable(header, tuple(rows), f"{evidence.caption(ids)} {BOLD_RULE} {tuned} {MIXED_PROTOCOLS}")
+    return TextTable(header, tuple(rows), f"{caption(evidence, ids)} {BOLD_RULE} {tuned} {MIXED_PROTOCOLS}")
 
 
 def _total_rows(evidence: Evidence, methods: list[str]) -> list[tuple[str, ...]]:
@@ -254,7 +255,7 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
         f"the same weight. The interval is a stratified bootstrap over seeds within data sets ({N_RESAMPLES:,} resamples; "
         f"none with one seed); the deviation of the total takes the rows as independent. {MIXED_PROTOCOLS}"
     )
-    return TextTable(header, tuple(rows), f"{evidence.caption(ids, variants)} {note}")
+    return TextTable(header, tuple(rows), f"{caption(evidence, ids, variants)} {note}")
 
 
 def long_table(evidence: Evidence) -> TextTable:

@@ -65,7 +65,8 @@ SETTLED = round(5 / (TAU * (1 - GAMMA)))
 
 def _second_halves(evidence: Evidence, names: list[str], measure: Callable[[np.ndarray], float]) -> Values:
     """A measure of the second half of each variant's curve of in-data Q (mean over seeds), where that has settled."""
-    dataset_id, values = evidence.id_of(None), scoped(evidence, names)
+    evidence = evidence.among(names)
+    dataset_id, values = evidence.id_of(None), scoped(evidence)
     if dataset_id is not None and (evidence.n_updates(dataset_id) or 0) < 2 * SETTLED:
         return values
     for name in names:
@@ -180,6 +181,7 @@ def _bounds(evidence: Evidence) -> list[Verdict]:
 
 
 def _ood(evidence: Evidence) -> list[Verdict]:
+    evidence = evidence.among(["probe"])
     dataset_id, probe = evidence.id_of(None), evidence.experiment.variant("probe")
     found = []
     for metric, text in (
@@ -187,7 +189,7 @@ def _ood(evidence: Evidence) -> list[Verdict]:
         ("probe_max", "max OOD Q - in-data Q is lower with a larger beta"),
         ("probe_min", "min OOD Q - in-data Q is lower with a larger beta"),
     ):
-        values: Values | None = scoped(evidence, ["probe"])
+        values: Values | None = scoped(evidence)
         for beta in (0, *PROBE_BETAS):
             value = None
             if dataset_id is not None:
@@ -330,18 +332,20 @@ def _lost(evidence: Evidence, name: str) -> bool:
 
 
 def _sac(evidence: Evidence) -> list[Verdict]:
-    found, data = [], evidence.id_of(None)
+    found = []
     for alpha in ("alpha 1", "alpha auto"):
         names = [f"SAC, {alpha}", f"SAC with V, {alpha}"]
+        view = evidence.among(names)
+        data = view.id_of(None)
         q_values = values_of(evidence, names, "q_data")
         lower, text = None, text_of(q_values)
         if q_values is not None and q_values[names[0]] > 0:
-            if data is not None and (evidence.n_updates(data) or 0) >= SETTLED:
+            if data is not None and (view.n_updates(data) or 0) >= SETTLED:
                 lower = q_values[names[1]] < 0.5 * q_values[names[0]]
             else:
                 text += f"; needs runs of {SETTLED:,} steps: before, Q is on the way to its level"
-        elif _lost(evidence, names[0]) and evidence.curve(evidence.experiment.variant(names[1]), data or "", "q_data").size:
-            lower = not _lost(evidence, names[1])
+        elif _lost(view, names[0]) and view.curve(view.experiment.variant(names[1]), data or "", "q_data").size:
+            lower = not _lost(view, names[1])
         rule = f"Q of SAC with V below half of that of SAC, or SAC diverges and this does not ({TENTH})"
         claim = f"V alone makes Q far lower (paper: 4000 and 400), {alpha}"
         found.append(judge(claim, rule, lower, text))
@@ -478,10 +482,19 @@ def _leading(evidence: Evidence) -> list[Verdict]:
             )
         rule += "; the 5 % of the test are divided among all comparisons of the claim"
         absent = [f"{name} on {missing.count(name)} of {len(ids)} sets" for name in sorted(set(missing))]
-        numbers = ", ".join(f"{name}: {place} ({evidence.scope(name, agents)})" for name, place in places.items())
+        numbers = "; ".join(_by_scope(evidence, agents, places))
         numbers = f"place of DCE: {numbers or '-'}" + (f"; without runs of this length: {', '.join(absent)}" if absent else "")
         found.append(judge(claim, rule, holds, numbers))
     return found
+
+
+def _by_scope(evidence: Evidence, agents: list[Variant], numbers: dict[str, int]) -> list[str]:
+    """Numbers of data sets, those of one length and one number of seeds together."""
+    found: dict[str, list[str]] = {}
+    for name, number in numbers.items():
+        scope = evidence.scope(name, agents).removeprefix(f"{name}, ")
+        found.setdefault(scope, []).append(f"{name}: {number}")
+    return [f"{', '.join(parts)} ({scope})" for scope, parts in found.items()]
 
 
 def _is_clearly_behind(evidence: Evidence, dataset_id: str, agents: list[Variant], n_tests: int) -> bool:
@@ -507,7 +520,7 @@ def _is_clearly_above(evidence: Evidence, one: Variant, other: Variant, dataset_
     if not all(map(len, scores)):
         return False
     means = [float(each.mean()) for each in scores]
-    errors = [uncertainty(evidence, v, dataset_id) for v in (one, other)]
+    errors = [uncertainty(evidence, each, dataset_id) for each in scores]
     return differs(means[0] - means[1], errors[0], errors[1], n_tests) is True
 
 
@@ -540,7 +553,7 @@ def _adroit(evidence: Evidence) -> list[Verdict]:
             if min(n_runs) >= FEWEST_SEEDS and any(lost):  # what diverges on a seed has failed
                 ups += [lost[1]] if lost[0] != lost[1] else []
             elif min(map(len, scores)) >= FEWEST_SEEDS:
-                spread = [uncertainty(evidence, v, name) for v in (with_, without)]
+                spread = [uncertainty(evidence, each, name) for each in scores]
                 ups.append(differs(float(scores[0].mean() - scores[1].mean()), spread[0], spread[1]))
         if same_kind and len(scores[0]) > 1 and not isinstance(row_of(with_.algo, name)["ent_coef"], str):
             wide[name] = scores[0]

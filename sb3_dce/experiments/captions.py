@@ -1,0 +1,85 @@
+"""Where the numbers of a table or figure come from, in words: data with hash, length, seeds, code, and what is not shown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import pandas as pd
+
+from sb3_dce.experiments.evidence import Evidence, runs_in, span
+from sb3_dce.experiments.grid import Scale, Variant, source_of
+
+
+def caption(evidence: Evidence, dataset_ids: Iterable[str], variants: Iterable[Variant] | None = None) -> str:
+    """
+    :param evidence: rows
+    :param dataset_ids: data shown
+    :param variants: agents shown; ``None`` for all
+    :return: as :func:`caption_of`, of their runs
+    """
+    agents = list(evidence.experiment.variants if variants is None else variants)
+    return caption_of(evidence, evidence.shown(dict.fromkeys(dataset_ids), agents), agents)
+
+
+def caption_of(evidence: Evidence, rows: pd.DataFrame, variants: list[Variant]) -> str:
+    """
+    :param evidence: rows of an experiment
+    :param rows: of these, of the runs shown
+    :param variants: agents shown
+    :return: where the numbers come from
+    """
+    if rows.empty:
+        return "No data."
+    runs = runs_in(rows)
+    seeds = runs.drop_duplicates(["dataset", "agent", "config_hash", "seed"])
+    counts = sorted(seeds.groupby(["dataset", "agent", "config_hash"], observed=True).size().unique())
+    episodes = sorted(rows[rows["metric"] == "n_episodes"]["value"].astype(int).unique())
+    embedded = evidence.scale.source == "embedded"
+    protocol = f"Gradient steps: {span(sorted(runs['n_updates'].unique()))}; seeds: {span(counts)}; last policy"
+    protocol += f", {span(episodes)} episode{'' if episodes[-1] == 1 else 's'}" if episodes else ""
+    parts = ["Smoke scale, a test of the machinery: numbers and verdicts say nothing about the agents."] if embedded else []
+    parts += [f"Data (sha256): {_data(rows)}.", f"{protocol}.", f"Code: {_versions(rows['code_version'].unique())}."]
+    ran = [v for v in variants if (runs["agent"] == v.algo).any()]
+    changed = [f"{v.name} has {known}" for v in ran if (known := _scale_settings(evidence.scale, v))]
+    if changed and not embedded:
+        parts.append(f"At this scale {'; '.join(changed)}.")
+    if further := _further(evidence, runs, variants):
+        parts.append(f"Further runs, of other lengths: {'; '.join(further)}.")
+    return " ".join(parts)
+
+
+def _data(rows: pd.DataFrame) -> str:
+    """Files of one source, run on devices alike, stand together: a table of twelve sets says each thing once."""
+    groups: dict[str, list[str]] = {}
+    for name, of in rows.groupby("dataset", sort=False, observed=True):
+        source = "of D4RL" if source_of(str(name)) == "D4RL" else "made with this package, not D4RL's"
+        how = f"{source} (run on {' and '.join(sorted(of['device'].unique()))})"
+        groups.setdefault(how, []).append(f"`{name}` {', '.join(h[:8] for h in of['dataset_sha256'].unique())}…")
+    return "; ".join(f"{', '.join(names)}, {how}" for how, names in groups.items())
+
+
+def _versions(versions: Iterable[str]) -> str:
+    """As "0.1.0 (commits 0123456, 89abcde)"."""
+    commits: dict[str, list[str]] = {}
+    for version in sorted(versions):
+        release, _, commit = version.partition("+")
+        commits.setdefault(release, []).extend([commit[:7]] if commit else [])
+    return ", ".join(
+        release + (f" (commit{'s' if len(of) > 1 else ''} {', '.join(of)})" if of else "") for release, of in commits.items()
+    )
+
+
+def _scale_settings(scale: Scale, variant: Variant) -> str:
+    settings = scale.set_for.get(variant.algo, {})
+    return ", ".join(f"{name}={value}" for name, value in settings.items() if name not in variant.set)
+
+
+def _further(evidence: Evidence, runs: pd.DataFrame, variants: list[Variant]) -> list[str]:
+    """Runs of these agents on the files shown that are not among those shown."""
+    found, here = [], set(runs.itertuples(index=False, name=None))
+    for name, sha in runs[["dataset", "dataset_sha256"]].drop_duplicates().itertuples(index=False, name=None):
+        of = evidence.every_run(name, variants)
+        more = [run for run in of[of["dataset_sha256"] == sha].itertuples(index=False, name=None) if run not in here]
+        lengths = [run[list(of.columns).index("n_updates")] for run in more]
+        found += [f"{lengths.count(n)} of {n:,} steps on {name}" for n in sorted(set(lengths))]
+    return found
