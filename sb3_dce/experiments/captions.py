@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import pandas as pd
 
@@ -40,7 +41,8 @@ def caption_of(evidence: Evidence, rows: pd.DataFrame, variants: list[Variant]) 
     parts = ["Smoke scale, a test of the machinery: numbers and verdicts say nothing about the agents."] if embedded else []
     parts += [f"Data (sha256): {_data(rows)}.", f"{protocol}.", f"Code: {_versions(rows['code_version'].unique())}."]
     ran = [v for v in variants if (runs["agent"] == v.algo).any()]
-    changed = [f"{v.name} has {known}" for v in ran if (known := _scale_settings(evidence.scale, v))]
+    changed = [f"every agent has {_settings(evidence.scale.set)}"] if evidence.scale.set else []
+    changed += [f"{v.name} has {known}" for v in ran if (known := _scale_settings(evidence.scale, v))]
     if changed and not embedded:
         parts.append(f"At this scale {'; '.join(changed)}.")
     if further := _further(evidence, runs, variants):
@@ -71,7 +73,11 @@ def _versions(versions: Iterable[str]) -> str:
 
 def _scale_settings(scale: Scale, variant: Variant) -> str:
     settings = scale.set_for.get(variant.algo, {})
-    return ", ".join(f"{name}={value}" for name, value in settings.items() if name not in variant.set)
+    return _settings({name: value for name, value in settings.items() if name not in variant.set})
+
+
+def _settings(settings: dict[str, Any]) -> str:
+    return ", ".join(f"{name}={value}" for name, value in settings.items())
 
 
 def _further(evidence: Evidence, runs: pd.DataFrame, variants: list[Variant]) -> list[str]:

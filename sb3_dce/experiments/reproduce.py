@@ -312,7 +312,7 @@ def _say_plan(
         console.print(f"{len(runs)} runs of {lengths} gradient steps, {complete} of them complete; data: {data}", markup=False)
     if complete and precision != "float32":
         console.print("complete runs are taken with the precision they have", markup=False)
-    small = next((scale for scale in scales.values() if scale.set), None)
+    small = next((scale for scale in scales.values() if scale.source == "embedded"), None)
     if small is not None and runs:
         console.print(
             f"smoke scale: tiny data, {small.updates} updates, settings {small.set} {small.set_for}: a test of the machinery; "
@@ -321,7 +321,9 @@ def _say_plan(
         )
     elif runs:
         algos = {run.spec.algo for run in runs.values()}
-        changed = {algo: kwargs for scale in scales.values() for algo, kwargs in scale.set_for.items() if algo in algos}
+        common = next(iter(scales.values())).set
+        changed = {"every agent": common} if common else {}
+        changed |= {algo: kwargs for scale in scales.values() for algo, kwargs in scale.set_for.items() if algo in algos}
         for algo, kwargs in changed.items():
             settings = ", ".join(f"{name}={value}" for name, value in kwargs.items())
             console.print(f"at this scale {algo} has {settings}", markup=False)
@@ -381,7 +383,7 @@ def _show(name: str, header: tuple[str, ...], rows: tuple[tuple[str, ...], ...],
         shown = [i for i, title in enumerate(header) if i and (not title.startswith(HIDDEN) or title == "paper: DCE")]
         console.print(f"[italic]{name}[/italic]")
         for row in known:
-            cells = [f"{header[i].removeprefix('ours: ')} {row[i]}" for i in shown]
+            cells = [f"{header[i].removeprefix('ours: ')} {row[i]}" for i in shown if row[i]]
             console.print(f"{row[0]}:  {'   '.join(cells)}".replace("**", ""), markup=False)
     missing = [row[0] for row in rows if row[0].endswith(ABSENT)]
     if missing:

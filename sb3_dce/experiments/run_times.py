@@ -83,7 +83,7 @@ def run_times(evidence: Evidence, variant: Variant, dataset_ids: list[str]) -> l
     :return: of each complete run, whatever its length, that was trained alone: members of a population have its time together
     """
     # smoke scale has small networks
-    fewer, runs = has_fewer_draws(evidence, variant) or bool(evidence.scale.set), []
+    fewer, runs = has_fewer_draws(evidence, variant) or evidence.scale.source == "embedded", []
     for name in dataset_ids:
         rows = pd.concat([evidence.runs(variant, name), evidence.of_other_length(variant, name)])
         alone = rows[(rows["metric"] == "seconds") & ~rows["device"].str.contains("population")]

@@ -483,7 +483,9 @@ def _leading(evidence: Evidence) -> list[Verdict]:
         rule += "; the 5 % of the test are divided among all comparisons of the claim"
         absent = [f"{name} on {missing.count(name)} of {len(ids)} sets" for name in sorted(set(missing))]
         numbers = "; ".join(_by_scope(evidence, agents, places))
-        numbers = f"place of DCE: {numbers or '-'}" + (f"; without runs of this length: {', '.join(absent)}" if absent else "")
+        numbers = (f"place of DCE: {numbers}" if numbers else "DCE was not run") + (
+            f"; without runs of this length: {', '.join(absent)}" if absent else ""
+        )
         found.append(judge(claim, rule, holds, numbers))
     return found
 
