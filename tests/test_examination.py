@@ -126,6 +126,7 @@ FAULTS: dict[str, tuple[Callable[[Arrays], None], str, str, int | None]] = {
     "far outside": (_set("actions", (3, 0), 55.0), "action bounds", "error", 1),
     "just outside": (_set("actions", (3, 0), 1.001), "action bounds", "warning", 1),
     "tiny actions": (lambda a: a["actions"].__imul__(0.4), "action scale", "note", None),
+    "one-sided action": (lambda a: np.abs(a["actions"][:, 1], out=a["actions"][:, 1]), "action scale", "note", 1),
     "constant action": (_set("actions", (slice(None), 1), 0.25), "constant actions", "note", 1),
     "saturated": (_set("actions", (slice(0, 50), 0), 1.0), "actions at the bounds", "note", 50),
     "integers": (_integers, "observation type", "warning", None),

@@ -145,7 +145,7 @@ def build_rows(
             )
         _require_rows(used, where)
     _check_content(rows, layout, summaries, sources, findings)
-    actions = check_actions(rows[:, layout.actions], summaries["actions"], options, findings, where)
+    actions = check_actions(rows[:, layout.actions], summaries["actions"], options, findings, where, spec)
     rewards = _reward_facts(rows[:, layout.rewards.start], episodes, used)
     whole = _whole_episodes(episodes, rewards.returns, bad)
     if INCOMPLETE in sources:

@@ -456,7 +456,7 @@ _RULES = (
     _Rule("action bounds", _bounds_text, "Give the bounds with action_low and action_high"),
     _Rule(
         "action scale",
-        lambda data: "the actions fill more than the inner half of their bounds",
+        lambda data: "the actions fill more than the inner half of their bounds, and both sides of their middle",
         "Give the true bounds with action_low and action_high, so that they are scaled to [-1, 1]",
     ),
     _Rule(

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sb3_dce.data.catalog import DatasetSpec
 from sb3_dce.data.columns import ColumnSummary
 from sb3_dce.data.episodes import MAX_JUMP_SHARE, Episodes, find_jumps, find_shift
 from sb3_dce.data.hashes import row_hashes
@@ -104,7 +105,12 @@ def check_finite(
 
 
 def check_actions(
-    actions: np.ndarray, summary: ColumnSummary, options: ReadOptions, findings: Findings, where: str
+    actions: np.ndarray,
+    summary: ColumnSummary,
+    options: ReadOptions,
+    findings: Findings,
+    where: str,
+    spec: DatasetSpec | None = None,
 ) -> ActionRange:
     """
     Compare actions with their bounds, and move small excesses onto them.
@@ -114,6 +120,7 @@ def check_actions(
     :param options: bounds, and whether to clip
     :param findings: notes and warnings
     :param where: file, for messages
+    :param spec: entry of the catalogue, whose actions are known to have the bounds
     :return: what was found, and the bounds
     :raises DatasetSemanticsError: if actions are outside by more than 1 % of half the range and may not be clipped
     """
@@ -144,6 +151,9 @@ def check_actions(
             np.clip(actions[block], low, high, out=actions[block])
         text = f"{n_outside} action entries were outside of the bounds by up to {excess.max():.2g}: clipped"
         findings.warning("action bounds", text, n_outside)
+    elif spec is None and not options.names_bounds and (sided := _one_sided(lowest, highest, low + half_range)):
+        text = f"action entries {sided} keep to one half of their bounds: a valve from 0 to 1? Then the policy may ask for -1"
+        findings.note("action scale", text, len(sided))
     elif options.action_scale != "data" and _within_half(lowest, highest, low, half_range):
         findings.note("action scale", "all actions lie within the inner half of their bounds: is the scale right?")
     return ActionRange(np.clip(lowest, low, high), np.clip(highest, low, high), low, high)
@@ -278,6 +288,11 @@ def check_episodes(episodes: Episodes, n_dropped: int, has_timeouts: bool, limit
     if limit is not None and longest > limit:
         text = f"episodes of up to {longest} rows are longer than the environment's limit of {limit} steps"
         findings.note("time limit", text)
+
+
+def _one_sided(lowest: np.ndarray, highest: np.ndarray, middle: np.ndarray) -> list[int]:
+    """Entries whose actions are all on one side of the middle of their bounds, the constant ones left out."""
+    return np.flatnonzero(((lowest >= middle) | (highest <= middle)) & (lowest < highest)).tolist()
 
 
 def _within_half(lowest: np.ndarray, highest: np.ndarray, low: np.ndarray, half_range: np.ndarray) -> bool:

@@ -106,7 +106,7 @@ class ReadOptions:
         :return: options with bounds
         :raises DatasetFormatError: if the attribute is something else
         """
-        if attribute is None or not (self.action_low is self.action_high is self.action_scale is None):
+        if attribute is None or self.names_bounds:
             return self
         try:
             bounds = json.loads(attribute)
@@ -119,6 +119,13 @@ class ReadOptions:
                 key=BOUNDS_ATTRIBUTE,
             ) from error
         return replace(self, action_low=low, action_high=high)
+
+    @property
+    def names_bounds(self) -> bool:
+        """
+        :return: whether the caller or the file says which bounds the actions have
+        """
+        return not (self.action_low is self.action_high is self.action_scale is None)
 
     def action_bounds(
         self, act_dim: int, lowest: np.ndarray | None = None, highest: np.ndarray | None = None
