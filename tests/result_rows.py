@@ -27,14 +27,15 @@ def run_rows(
     scale: Scale | None = None,
 ) -> pd.DataFrame:
     """Rows of one complete run; curves have equally spaced points up to its end."""
-    chosen = experiment.variant(variant)
+    chosen, scale = experiment.variant(variant), scale or experiment.scales["cpu"]
+    settings = {**scale.set, **scale.set_for.get(chosen.algo, {}), **chosen.set}
     common = {
         "experiment": experiment.id,
         "dataset": dataset,
         "dataset_sha256": sha,
         "agent": chosen.algo,
-        "hyperparameters": differences(chosen.algo, dataset, chosen.set),
-        "config_hash": variant_hash(chosen, dataset, scale or experiment.scales["cpu"]),
+        "hyperparameters": differences(chosen.algo, dataset, settings),
+        "config_hash": variant_hash(chosen, dataset, scale),
         "n_updates": n_updates,
         "seed": seed,
         "code_version": "0.1.0+0123456789",

@@ -269,8 +269,10 @@ def test_a_panel_is_as_long_as_its_own_lines(tmp_path: Path) -> None:
         panel.metric: max(c.index[-1] for c, _ in panel_curves(evidence, panel).values()) for panel in experiment.panels[:2]
     }
     assert ends == {"score": 100, "q_data": 200}, "BC has no runs of the length that the betas have"
-    text = make_report(evidence).caption
-    assert "Gradient steps: 100 to 200;" in text and "Further runs" not in text, "both are drawn"
+    report = make_report(evidence)
+    assert "Gradient steps: 100 to 200; seeds: 1;" in report.caption and "Further runs" not in report.caption, "both are drawn"
+    lengths = {(row[2], row[4]) for row in report.tables["long"].rows}
+    assert {("beta 2", "100"), ("BC", "100")} <= lengths
     only = caption(evidence, [CHEETAH], [experiment.variant("beta 2"), experiment.variant("BC")])
     assert f"Further runs, of other lengths: 1 of 200 steps on {CHEETAH}." in only
 

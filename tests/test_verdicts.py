@@ -182,7 +182,8 @@ def test_bound_and_shift_are_judged_by_the_worst_beta(factors: tuple[float, ...]
 
 
 @pytest.mark.parametrize(
-    ("pairs", "outcome"), [(((30, 20), (10, 10)), HELD), (((30, 20), (5, 25)), NOT_HELD), (((9, 9), (9, 12)), CLOSE)]
+    ("pairs", "outcome"),
+    [(((34, 20), (10, 10)), HELD), (((30, 20), (10, 10)), CLOSE), (((30, 20), (5, 25)), NOT_HELD), (((9, 9), (9, 12)), CLOSE)],
 )
 def test_dropout_has_to_help_somewhere_and_hurt_nowhere(pairs: Any, outcome: str) -> None:
     adroit = load_experiment("table-adroit-kitchen")
@@ -292,6 +293,52 @@ def test_a_claim_is_about_runs_as_long_as_those_of_its_own_agents() -> None:
     found = outcomes("fig-beta", results.merge([long, *short]))
     assert one_of(found, "In-data Q falls") == HELD, "the longer runs count, though most agents have shorter ones"
     assert one_of(found, "below BC") == HELD, "and BC is compared at the length it has"
+
+
+def test_all_numbers_of_a_claim_are_of_one_length() -> None:
+    agents = {f"{agent}, alpha {alpha}": 50.0 for agent in ("DCE", "Eq. 18") for alpha in (1, 5)} | {"Eq. 18, alpha 5": 2.0}
+    short = scored("fig-alpha-return", {CHEETAH: agents}, n_updates=50_000)
+    long = scored("fig-alpha-return", {CHEETAH: {"DCE, alpha 1": 80.0, "DCE, alpha 5": 10.0}}, n_updates=200_000)
+    claim = "At alpha 5 Eq. 18 fails and DCE works"
+    assert one_of(outcomes("fig-alpha-return", results.merge([short, long])), claim) == HELD, "Eq. 18 has no long runs"
+
+
+def test_alpha_of_several_data_sets_is_compared_at_one_length() -> None:
+    names = [f"{d}-sb3" for d in ("halfcheetah-medium", "hopper-medium", "walker2d-medium", "halfcheetah-medium-replay")]
+    short = scored("fig-alpha", {name: {"beta 4": 0.5} for name in names}, "ent_coef", n_updates=50_000)
+    long = scored("fig-alpha", {CHEETAH: {"beta 4": 5.0}}, "ent_coef", n_updates=200_000)
+    found = outcomes("fig-alpha", results.merge([short, long]))
+    assert one_of(found, "between data sets (MuJoCo)") == NOT_HELD
+
+
+def test_runs_of_the_papers_length_are_compared_with_it_though_others_are_shorter() -> None:
+    table = load_experiment("table1")
+    full = table.scales["full"]
+    hopper = {"hopper-medium-v2": {"DCE": [70.0, 75.0, 80.0, 76.0, 78.0]}}
+    long = table_rows(table, hopper, n_updates=1_000_000, scale=full)
+    short = table_rows(table, {"hopper-medium-v2": {"BC": [40.0], "IQL": [40.0]}}, n_updates=50_000, scale=full)
+    assert reproduction(Evidence(table, results.merge([long, short]), full)).numbers.startswith("1 of 1 rows")
+
+
+def test_wave_of_a_run_that_diverged_is_not_judged() -> None:
+    experiment = load_experiment("fig-beta")
+    curve = [float(i % 3) for i in range(20)]
+    runs = [run_rows(experiment, f"beta {b}", CHEETAH, 0, curves={"q_data": curve}, n_updates=200_000) for b in (0, 2, 4, 8)]
+    assert one_of(outcomes("fig-beta", results.merge(runs)), "large wave") != UNTESTED
+    broken = runs[1][runs[1]["step"] <= 150_000]
+    assert one_of(outcomes("fig-beta", results.merge([runs[0], broken, *runs[2:]])), "large wave") == UNTESTED
+
+
+def test_parts_of_an_experiment_are_of_one_file() -> None:
+    experiment = load_experiment("fig-beta")
+    new, old = "cd" * 32, "ab" * 32
+    runs = [
+        run_rows(experiment, f"beta {b}", CHEETAH, s, curves={"q_data": [1.0] * 4}, sha=new) for b in (0, 2) for s in (0, 1)
+    ]
+    runs += [run_rows(experiment, "beta 8, c 0.5", CHEETAH, 0, curves={"q_data": [1.0] * 4}, sha=old)]
+    evidence = Evidence(experiment, results.merge(runs), experiment.scales["cpu"])
+    assert evidence.among(["beta 8, c 0.5"]).id_of(None) is None and evidence.id_of(None) == CHEETAH
+    assert evidence.left_out == 1
 
 
 def test_borrowed_deviation_is_no_second_estimate() -> None:

@@ -32,8 +32,8 @@ def caption_of(evidence: Evidence, rows: pd.DataFrame, variants: list[Variant]) 
     if rows.empty:
         return "No data."
     runs = runs_in(rows)
-    seeds = runs.drop_duplicates(["dataset", "agent", "config_hash", "seed"])
-    counts = sorted(seeds.groupby(["dataset", "agent", "config_hash"], observed=True).size().unique())
+    alike = [column for column in runs.columns if column != "seed"]
+    counts = sorted(runs.groupby(alike, observed=True).size().unique())
     episodes = sorted(rows[rows["metric"] == "n_episodes"]["value"].astype(int).unique())
     embedded = evidence.scale.source == "embedded"
     protocol = f"Gradient steps: {span(sorted(runs['n_updates'].unique()))}; seeds: {span(counts)}; last policy"

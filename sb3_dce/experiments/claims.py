@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from sb3_dce.experiments.evidence import Evidence
-from sb3_dce.experiments.judging import HELD, NOT_HELD, UNTESTED, Values, Verdict, judge, lengths_and_seeds, spreads_beyond
+from sb3_dce.experiments.judging import HELD, NOT_HELD, UNTESTED, Values, Verdict, judge, spreads_beyond
 from sb3_dce.experiments.paper import PAPER_SEEDS, gym_rows, leaders, paper_score, paper_scores, paper_total
 from sb3_dce.experiments.run_times import RunTime, fastest_runs
 from sb3_dce.experiments.statistics import sample_std
@@ -146,8 +146,9 @@ def _seeds_matter(evidences: list[Evidence]) -> Verdict:
     for evidence in evidences:
         dce = evidence.experiment.variant("DCE")
         for _, name in evidence.table_rows():
-            if len(scores := evidence.last(dce, name)) > 1:
-                spreads[name], scopes[name] = scores, lengths_and_seeds(evidence, dce, [name])
+            most = evidence.last_of_most_seeds(dce, name)
+            if most is not None and len(most[0]) > 1:
+                spreads[name], scopes[name] = most[0], f"{most[1]:,} steps, {len(most[0])} seeds"
     widest = sorted(spreads, key=lambda name: -sample_std(spreads[name]))[:3]
     numbers = Values((f"{name}, {scopes[name]}", sample_std(spreads[name])) for name in widest).text()
     holds = spreads_beyond(spreads, 10.0, "hopper-medium", "pen-human")

@@ -22,9 +22,10 @@ def view_of(evidence: Evidence, panel: Panel) -> Evidence:
     """
     :param evidence: rows
     :param panel: picture
-    :return: rows of its variants alone, which may have longer runs than all of the figure
+    :return: rows of its variants alone, which may have longer runs than all of the figure; of one length over all its data
     """
-    return evidence.among([*variants_of(evidence, panel), *([panel.reference] if panel.reference else [])])
+    names = [*variants_of(evidence, panel), *([panel.reference] if panel.reference else [])]
+    return evidence.of_one_length(names, panel.over or (panel.dataset,))
 
 
 def panel_curves(evidence: Evidence, panel: Panel) -> dict[str, tuple[pd.DataFrame, pd.Series | None]]:

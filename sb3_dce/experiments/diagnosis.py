@@ -7,8 +7,9 @@ This looks for causes; nothing found here is put into a results table.
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 
-from sb3_dce.experiments.captions import caption
+from sb3_dce.experiments.captions import caption_of
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import Variant
 from sb3_dce.experiments.judging import CLEARLY, CLOSE, Uncertainty, differs, uncertainty
@@ -54,7 +55,7 @@ def variant_table(evidence: Evidence) -> TextTable:
         "rounding alone and is not counted. Rising and falling are the same share between the middle and the end of the run; "
         "the survival condition is that the mean reward exceeds beta_eff."
     )
-    return TextTable(header, tuple(rows), f"{caption(evidence, [n for _, n in evidence.table_rows()])} {note}")
+    return TextTable(header, tuple(rows), f"{_caption(evidence)} {note}")
 
 
 def diagnostics_table(evidence: Evidence) -> TextTable:
@@ -80,7 +81,14 @@ def diagnostics_table(evidence: Evidence) -> TextTable:
         "Diagnostics of DCE with the paper's row; means over the last tenth of the run where nothing else is said. The "
         "survival margin is the mean reward less beta_eff: below 0, with terminals, ending an episode pays."
     )
-    return TextTable(header, tuple(rows), f"{caption(evidence, [n for _, n in evidence.table_rows()], [dce])} {note}")
+    return TextTable(header, tuple(rows), f"{_caption(evidence, dce)} {note}")
+
+
+def _caption(evidence: Evidence, *agents: Variant) -> str:
+    """These tables show nothing of another length than the row's but what a finding names."""
+    variants = list(agents or evidence.experiment.variants)
+    runs = [evidence.runs(v, name) for _, name in evidence.table_rows() for v in variants]
+    return caption_of(evidence, pd.concat(runs) if runs else pd.DataFrame(), variants)
 
 
 def verdict_of(evidence: Evidence, dataset_id: str) -> str:

@@ -61,30 +61,50 @@ class Evidence:
         hash_here: Callable[[str], str | None] = lambda _: None,
     ) -> None:
         self.experiment, self.scale = experiment, scale
-        if experiment.report != TIMING:
+        if experiment.report != TIMING and (rows["experiment"] == TIMING).any():
             rows = rows[rows["experiment"] != TIMING]
         self._rows, self._n_updates, self._hash_here = rows, n_updates, hash_here
-        self._selected: dict[str, pd.DataFrame] = {}
-        self._others: dict[str, pd.DataFrame] = {}
+        self._whole = self
+        self._sha_of: dict[str, str] = {}
+        self._on_file: dict[str, pd.DataFrame] = {}
+        self._length_of: dict[str, int | None] = {}
+        self._of_variant: dict[tuple[str, str], pd.DataFrame] = {}
         self._runs: dict[tuple[str, str], pd.DataFrame] = {}
-        self._views: dict[tuple[str, ...], Evidence] = {}
+        self._views: dict[tuple[tuple[str, ...], int | None], Evidence] = {}
         self._again: dict[tuple[str, str], list[pd.DataFrame]] = {}
         self.left_out = 0
 
-    def among(self, names: Iterable[str]) -> Evidence:
+    # -- a part of it ----------------------------------------------------------------------------------------------
+
+    def among(self, names: Iterable[str], n_updates: int | None = None) -> Evidence:
         """
         :param names: of variants
-        :return: the same rows for these variants alone: those of a figure's panel may have longer runs than all of the figure
+        :param n_updates: only runs of this length; ``None`` for the one that most of these variants have
+        :return: the same rows for these variants alone, of the same files: those of a figure's panel may have longer runs than
+            all of the figure
         """
-        variants = tuple(v for v in self.experiment.variants if v.name in set(names))
-        key = tuple(v.name for v in variants)
+        wanted = set(names)
+        variants = tuple(v for v in self.experiment.variants if v.name in wanted)
+        length = self._n_updates if self._n_updates is not None else n_updates
+        key = tuple(v.name for v in variants), length
         if key not in self._views:
-            experiment = replace(self.experiment, variants=variants)
-            view = Evidence(experiment, self._rows, self.scale, self._n_updates, self._hash_here)
-            view._again = self._again
+            view = Evidence(replace(self.experiment, variants=variants), self._rows, self.scale, length, self._hash_here)
+            view._whole, view._again = self._whole, self._again
             view.__dict__["_groups"] = self._groups  # to group all rows takes longer than all else
             self._views[key] = view
         return self._views[key]
+
+    def of_one_length(self, names: Iterable[str], papers: Iterable[str | None] = (None,)) -> Evidence:
+        """
+        :param names: of variants
+        :param papers: D4RL ids; ``None`` for the grid's first
+        :return: as :meth:`among`, of the length that most of these variants have over all these data, the longest of several
+        """
+        names = list(names)
+        view = self.among(names)
+        ids = [name for name in map(view.id_of, papers) if name is not None]
+        runs = [runs_in(view._of_any_length(name)) for name in ids]
+        return self.among(names, _usual_length(pd.concat(runs)) if runs else None)
 
     # -- which data ------------------------------------------------------------------------------------------------
 
@@ -162,32 +182,48 @@ class Evidence:
 
     # -- which runs ------------------------------------------------------------------------------------------------
 
-    def _of_dataset(self, dataset_id: str) -> pd.DataFrame:
-        """All runs of the experiment's variants on one file, of one length."""
-        if dataset_id in self._selected:
-            return self._selected[dataset_id]
-        keys = {(dataset_id, v.algo, variant_hash(v, dataset_id, self.scale)): v for v in self.experiment.variants}
+    def _variants_on(self, dataset_id: str) -> list[Variant]:
+        """Those that the grid has on these data; at smoke scale those of its first."""
+        entries = [d for d in self.experiment.datasets if dataset_id in d.ids] or self.experiment.datasets[:1]
+        return [v for v in self.experiment.variants if any(v in self.variants(entry) for entry in entries)]
+
+    def _own_and_shared(self, dataset_id: str) -> tuple[pd.DataFrame, pd.DataFrame]:
+        """Runs of the variants on any version of a file; and with them those of other variants that are the same agents."""
+        keys = {(dataset_id, v.algo, variant_hash(v, dataset_id, self.scale)): v for v in self._variants_on(dataset_id)}
         parts = [self._groups[key] for key in sorted(keys) if key in self._groups]
         again = [part for variant in keys.values() for part in self._of_the_same_agent(variant, dataset_id)]
-        found = pd.concat([*parts, *again]) if parts or again else self._rows.iloc[:0]
-        runs, once = (runs_in(rows) for rows in (found, pd.concat(parts) if parts else found.iloc[:0]))
-        if len(runs):
-            sha = _commonest(runs["dataset_sha256"])
-            if (runs["dataset_sha256"] != sha).any():
-                here = self._hash_here(dataset_id)
-                sha = here if here is not None and here in set(runs["dataset_sha256"]) else sha
-            ours = runs[runs["dataset_sha256"] == sha]
+        nothing = self._rows.iloc[:0]
+        return pd.concat(parts) if parts else nothing, pd.concat([*parts, *again]) if parts or again else nothing
+
+    def _file(self, dataset_id: str) -> str:
+        """SHA-256 of the version of a file that is taken, the same for all parts of the experiment."""
+        known = self._whole._sha_of
+        if dataset_id not in known:
+            own, found = self._whole._own_and_shared(dataset_id)
+            hashes = runs_in(found)["dataset_sha256"]
+            here = self._hash_here(dataset_id) if hashes.nunique() > 1 else None
+            known[dataset_id] = here if here in set(hashes) else _commonest(hashes)  # type: ignore[assignment]
+            self._whole.left_out += int((runs_in(own)["dataset_sha256"] != known[dataset_id]).sum())
+        return known[dataset_id]
+
+    def _of_any_length(self, dataset_id: str) -> pd.DataFrame:
+        """All runs of the variants on one file."""
+        if dataset_id not in self._on_file:
+            _, found = self._own_and_shared(dataset_id)
+            self._on_file[dataset_id] = found[found["dataset_sha256"] == self._file(dataset_id)] if len(found) else found
+        return self._on_file[dataset_id]
+
+    def n_updates(self, dataset_id: str) -> int | None:
+        """
+        :param dataset_id: data
+        :return: length of its runs, gradient steps
+        """
+        if dataset_id not in self._length_of:
+            runs = runs_in(self._of_any_length(dataset_id))
             if self._n_updates is not None:
-                length = self._n_updates
-            else:
-                cells = ours.drop_duplicates(["agent", "config_hash", "n_updates"])["n_updates"].value_counts()
-                length = int(max(cells.index, key=lambda n: (cells[n], n)))
-            taken = (found["dataset_sha256"] == sha) & (found["n_updates"] == length)
-            self.left_out += int((once["dataset_sha256"] != sha).sum())
-            self._others[dataset_id] = found[(found["dataset_sha256"] == sha) & ~taken]
-            found = found[taken]
-        self._selected[dataset_id] = found
-        return found
+                runs = runs[runs["n_updates"] == self._n_updates]
+            self._length_of[dataset_id] = _usual_length(runs) if len(runs) else None
+        return self._length_of[dataset_id]
 
     def _of_the_same_agent(self, variant: Variant, dataset_id: str) -> list[pd.DataFrame]:
         """
@@ -225,17 +261,31 @@ class Evidence:
         settings = settings_in_force(variant, dataset_id, self.scale)
         return agent_key(variant.algo, settings, self.n_updates(dataset_id) or 1)
 
+    def runs_of_any_length(self, variant: Variant, dataset_id: str) -> pd.DataFrame:
+        """
+        :param variant: of the experiment
+        :param dataset_id: data
+        :return: rows of its runs, also those of another variant that is the same agent over their length; only those of the
+            length that the caller named, if one is
+        """
+        key = (variant.name, dataset_id)
+        if key not in self._of_variant:
+            rows = self._of_any_length(dataset_id)
+            wanted = variant_hash(variant, dataset_id, self.scale)
+            rows = rows[(rows["agent"] == variant.algo) & (rows["config_hash"] == wanted)]
+            self._of_variant[key] = rows if self._n_updates is None else rows[rows["n_updates"] == self._n_updates]
+        return self._of_variant[key]
+
     def runs(self, variant: Variant, dataset_id: str) -> pd.DataFrame:
         """
         :param variant: of the experiment
         :param dataset_id: data
-        :return: rows of its runs, also those of another variant that is the same agent over their length
+        :return: as :meth:`runs_of_any_length`, those of the length that most variants have there
         """
         key = (variant.name, dataset_id)
         if key not in self._runs:
-            rows = self._of_dataset(dataset_id)
-            wanted = variant_hash(variant, dataset_id, self.scale)
-            self._runs[key] = rows[(rows["agent"] == variant.algo) & (rows["config_hash"] == wanted)]
+            rows = self.runs_of_any_length(variant, dataset_id)
+            self._runs[key] = rows[rows["n_updates"] == self.n_updates(dataset_id)]
         return self._runs[key]
 
     def of_other_length(self, variant: Variant, dataset_id: str) -> pd.DataFrame:
@@ -244,13 +294,8 @@ class Evidence:
         :param dataset_id: data
         :return: rows of its longest runs, if it has none of the length of the others and the caller named no length
         """
-        rows = self._of_dataset(dataset_id).iloc[:0]
-        if self._n_updates is None and not len(self.runs(variant, dataset_id)) and dataset_id in self._others:
-            rows = self._others[dataset_id]
-            wanted = variant_hash(variant, dataset_id, self.scale)
-            rows = rows[(rows["agent"] == variant.algo) & (rows["config_hash"] == wanted)]
-            rows = rows[rows["n_updates"] == rows["n_updates"].max()]
-        return rows
+        rows = self.runs_of_any_length(variant, dataset_id)
+        return rows.iloc[:0] if len(self.runs(variant, dataset_id)) else rows[rows["n_updates"] == rows["n_updates"].max()]
 
     def last_of_longer(self, variant: Variant, dataset_id: str) -> tuple[np.ndarray, int] | None:
         """
@@ -258,21 +303,32 @@ class Evidence:
         :param dataset_id: data
         :return: scores at the end of its longest runs, and their gradient steps, if these are more than the others have
         """
-        rows = self._others.get(dataset_id, self._rows.iloc[:0])
-        wanted = variant_hash(variant, dataset_id, self.scale)
-        rows = rows[(rows["agent"] == variant.algo) & (rows["config_hash"] == wanted)]
+        rows = self.runs_of_any_length(variant, dataset_id)
         rows = rows[rows["n_updates"] > (self.n_updates(dataset_id) or 0)]
-        rows = rows[rows["n_updates"] == rows["n_updates"].max()]
-        scores = at_end(rows, "score")
-        return (scores, int(rows["n_updates"].iloc[0])) if len(scores) else None
+        return _scores_and_length(rows[rows["n_updates"] == rows["n_updates"].max()])
 
-    def n_updates(self, dataset_id: str) -> int | None:
+    def last_of_most_seeds(self, variant: Variant, dataset_id: str) -> tuple[np.ndarray, int] | None:
+        """
+        :param variant: of the experiment
+        :param dataset_id: data
+        :return: scores at the end of its runs of the length with the most seeds, the longest of several, and their gradient
+            steps; ``None`` without scores
+        """
+        ends = self.runs_of_any_length(variant, dataset_id)
+        ends = ends[(ends["metric"] == "score") & (ends["step"] == ends["n_updates"])]
+        counts = ends["n_updates"].value_counts()
+        usual = max(counts.index, key=lambda n: (counts[n], n), default=None)
+        return _scores_and_length(ends[ends["n_updates"] == usual])
+
+    def largest_spread(self, dataset_id: str) -> float:
         """
         :param dataset_id: data
-        :return: length of its runs, gradient steps
+        :return: largest standard deviation over seeds of an agent's last scores, of any length; 0 without any two seeds
         """
-        rows = self._of_dataset(dataset_id)
-        return int(rows["n_updates"].iloc[0]) if len(rows) else None
+        rows = self._of_any_length(dataset_id)
+        ends = rows[(rows["metric"] == "score") & (rows["step"] == rows["n_updates"])]
+        stds = ends.groupby(["agent", "config_hash", "n_updates"], observed=True)["value"].std(ddof=1).dropna()
+        return float(stds.max()) if len(stds) else 0.0
 
     # -- numbers ---------------------------------------------------------------------------------------------------
 
@@ -291,9 +347,7 @@ class Evidence:
         :param dataset_id: data
         :return: scores at the end of the runs of :meth:`of_other_length`, and their gradient steps; ``None`` without any
         """
-        rows = self.of_other_length(variant, dataset_id)
-        scores = at_end(rows, "score")
-        return (scores, int(rows["n_updates"].iloc[0])) if len(scores) else None
+        return _scores_and_length(self.of_other_length(variant, dataset_id))
 
     def start(self, variant: Variant, dataset_id: str, metric: str) -> float | None:
         """
@@ -404,9 +458,10 @@ class Evidence:
         """
         :param dataset_id: data
         :param variants: agents
-        :return: one line per run of theirs, of any length and on any version of the file
+        :return: one line per run of those that the grid has there, of any length and on any version of the file
         """
-        keys = {(dataset_id, v.algo, variant_hash(v, dataset_id, self.scale)) for v in variants}
+        here = self._variants_on(dataset_id)
+        keys = {(dataset_id, v.algo, variant_hash(v, dataset_id, self.scale)) for v in variants if v in here}
         parts = [self._groups[key] for key in sorted(keys) if key in self._groups]
         return runs_in(pd.concat(parts) if parts else self._rows.iloc[:0])
 
@@ -437,6 +492,18 @@ def curve_of(rows: pd.DataFrame, metric: str) -> pd.DataFrame:
     """
     rows = rows[(rows["metric"] == metric) & (rows["step"] > 0)]
     return rows.pivot(index="step", columns="seed", values="value").sort_index()
+
+
+def _usual_length(runs: pd.DataFrame) -> int:
+    """The length that most agents have, the longest of several."""
+    counts = runs.drop_duplicates(["dataset", "agent", "config_hash", "n_updates"])["n_updates"].value_counts()
+    return int(max(counts.index, key=lambda n: (counts[n], n)))
+
+
+def _scores_and_length(rows: pd.DataFrame) -> tuple[np.ndarray, int] | None:
+    """Last scores of runs of one length, in the order of the seeds."""
+    scores = at_end(rows, "score")
+    return (scores, int(rows["n_updates"].iloc[0])) if len(scores) else None
 
 
 def _commonest(values: pd.Series) -> str:

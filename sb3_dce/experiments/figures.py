@@ -177,7 +177,7 @@ def _planned_id(evidence: Evidence, paper: str | None) -> str:
 
 
 def _missing(evidence: Evidence, panel: Panel, curves: dict[str, tuple[pd.DataFrame, pd.Series | None]]) -> list[str]:
-    """Lines that belong to a panel and have no runs."""
+    """Lines that belong to a panel and have no runs of its length."""
     if panel.over:
         return [_planned_id(evidence, name) for name in panel.over if evidence.id_of(name) not in curves]
     if panel.lines:

@@ -28,7 +28,7 @@ SEED_STD_FREEDOM = 4
 CLEARLY = (
     "outside of the 95 % interval of Welch's test over seeds, where an agent with fewer than three has the largest standard "
     f"deviation of these: {SEED_STD:g} (DCE on HalfCheetah, five seeds), that of the paper's DCE on such data (five seeds), "
-    "those of the experiment's agents with two seeds or more on these data"
+    "those of the experiment's agents with two seeds or more on these data, after any number of steps"
 )
 # Seeds from which on an agent's own deviation is taken.
 FEWEST_OWN = 3
@@ -145,9 +145,8 @@ def uncertainty(evidence: Evidence, own: np.ndarray, dataset_id: str) -> Uncerta
     papers = {evidence.paper_id(dataset) for dataset, name in evidence.table_rows() if name == dataset_id}
     cells = [paper_score(paper, "DCE") for paper in papers]
     known = [cell.std for cell in cells if cell is not None and cell.std is not None]
-    others = [evidence.last(v, dataset_id) for v in evidence.experiment.variants]
-    known += [sample_std(scores) for scores in others if len(scores) > 1]
-    return Uncertainty(max([SEED_STD, *known]) / math.sqrt(n), SEED_STD_FREEDOM, borrowed=True)
+    largest = max([SEED_STD, evidence.largest_spread(dataset_id), *known])
+    return Uncertainty(largest / math.sqrt(n), SEED_STD_FREEDOM, borrowed=True)
 
 
 def above(values: Values | None, first: str, second: str) -> bool | str | None:

@@ -57,7 +57,7 @@ def write_page(
         "throughout.",
         *coverage(evidences),
         '"Not run": there are no runs yet. "No data": this needs files of D4RL, which are not here, and has no stand-in '
-        '(Kitchen). "No curve": this line of a figure has no runs.',
+        '(Kitchen). "No curve": this line of a figure has no runs of the length of the others.',
         f"Verdicts in the sections of the experiments: {count(every)}.",
         f'In the rules below "clearly" means {CLEARLY}.',
         "## The paper's claims",

@@ -85,7 +85,7 @@ def make_report(evidence: Evidence) -> Report:
 def drawn_in(evidence: Evidence) -> tuple[pd.DataFrame, list[Variant]] | None:
     """
     :param evidence: rows of one experiment
-    :return: rows of the runs of which there is a line in any panel, and their variants; ``None`` if all panels are empty
+    :return: rows of the runs that have a line in any panel, and the variants of these panels; ``None`` if all are empty
     """
     parts: list[pd.DataFrame] = []
     names: set[str] = set()
@@ -98,7 +98,7 @@ def drawn_in(evidence: Evidence) -> tuple[pd.DataFrame, list[Variant]] | None:
         lines = {*(variants_of(view, panel)[:1] if panel.over or panel.lines else curves)}
         lines |= {panel.reference} if panel.reference else set()
         parts.append(view.shown(ids, [v for v in view.experiment.variants if v.name in lines]))
-        names |= lines
+        names |= {v.name for v in view.experiment.variants}
     if not parts:
         return None
     return pd.concat(parts), [v for v in evidence.experiment.variants if v.name in names]
@@ -113,6 +113,7 @@ def reproduction(evidence: Evidence) -> Verdict:
     hits: list[str] = []
     misses: list[str] = []
     dce = evidence.experiment.variant("DCE")
+    evidence = evidence.among(["DCE"], PAPER_UPDATES)
     for dataset, name in evidence.table_rows():
         cell, scores = paper_score(dataset.paper, "DCE"), evidence.last(dce, name)
         if source_of(name) != "D4RL" or cell is None or cell.score is None or evidence.n_updates(name) != PAPER_UPDATES:
@@ -127,7 +128,7 @@ def reproduction(evidence: Evidence) -> Verdict:
         met = low <= cell.score + spread and high >= cell.score - spread
         (hits if met else misses).append(f"{name} ({scores.mean():.1f}, paper {cell.score:g})")
     n, wanted = len(hits) + len(misses), sum(paper_score(d.paper, "DCE") is not None for d in evidence.experiment.datasets)
-    numbers = f"no runs of {PAPER_UPDATES:,} steps on D4RL's own files"
+    numbers = f"no {PAPER_SEEDS} seeds of {PAPER_UPDATES:,} steps on D4RL's own files"
     if n:
         numbers = f"{len(hits)} of {n} rows, of {wanted} in the table; missed: {', '.join(misses) or 'none'}"
     rule = (

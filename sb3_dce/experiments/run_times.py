@@ -26,9 +26,11 @@ def runtime_table(evidence: Evidence) -> TextTable:
     """
     rows = []
     ids = [name for _, name in evidence.table_rows()]
+    listed = []
     for variant in evidence.experiment.variants:
         if variant.paper is None:  # DCE again, with other numbers
             continue
+        listed.append(variant)
         cell = paper_scores().get(("gym", "runtime-s", variant.paper))
         printed = "-" if cell is None or cell.score is None else f"{cell.score:g}"
         runs = run_times(evidence, variant, ids)
@@ -44,7 +46,7 @@ def runtime_table(evidence: Evidence) -> TextTable:
         f"(bf16-matmul) and fewer draws make an agent faster than the paper's. {MIXED_PROTOCOLS}"
     )
     header = ("agent", "device and precision", "s per 1000 updates (median)", "range", "runs", "paper: s per 1000, RTX 3070")
-    return TextTable(header, tuple(rows), f"{caption(evidence, ids)} {note}")
+    return TextTable(header, tuple(rows), f"{caption(evidence, ids, listed)} {note}")
 
 
 def has_fewer_draws(evidence: Evidence, variant: Variant) -> bool:
@@ -80,7 +82,8 @@ def run_times(evidence: Evidence, variant: Variant, dataset_ids: list[str]) -> l
     :param evidence: rows
     :param variant: agent
     :param dataset_ids: data
-    :return: of each complete run, whatever its length, that was trained alone: members of a population have its time together
+    :return: of each complete run that is shown, of the row's length or else its longest, and that was trained alone: members
+        of a population have its time together
     """
     # smoke scale has small networks
     fewer, runs = has_fewer_draws(evidence, variant) or evidence.scale.source == "embedded", []

@@ -261,7 +261,7 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
 def long_table(evidence: Evidence) -> TextTable:
     """
     :param evidence: rows
-    :return: one line per data and agent, for programs: last score, mean of the last ten evaluations, best, per seed
+    :return: one line per data, agent and length, for programs: last score, mean of the last ten evaluations, best, per seed
     """
     header = (
         *("dataset", "source", "agent", "hyperparameters", "n_updates", "n_seeds", "n_diverged", "mean", "std", "ci_low"),
@@ -269,10 +269,9 @@ def long_table(evidence: Evidence) -> TextTable:
         *("paper_dataset", "paper_score", "paper_std"),
     )
     rows = []
-    for dataset, name in evidence.table_rows():
-        for variant in evidence.variants(dataset):
-            runs = evidence.runs(variant, name)
-            runs = runs if len(runs) else evidence.of_other_length(variant, name)
+    cells = [(d, name, v) for d, name in evidence.table_rows() for v in evidence.variants(d)]
+    for dataset, name, variant in cells:
+        for length, runs in evidence.runs_of_any_length(variant, name).groupby("n_updates"):
             scores, lost = at_end(runs, "score"), int((runs["metric"] == "diverged").sum())
             if not len(scores) and not lost:
                 continue
@@ -289,7 +288,7 @@ def long_table(evidence: Evidence) -> TextTable:
             paper = evidence.paper_id(dataset)
             cell = None if variant.paper is None else paper_score(paper, variant.paper)
             printed = ["" if v is None else f"{v:g}" for v in ((None, None) if cell is None else (cell.score, cell.std))]
-            settings, length = runs["hyperparameters"].iloc[0], str(runs["n_updates"].iloc[0])
-            start = [name, source_of(name), variant.name, settings, length, str(len(scores)), str(lost)]
+            settings = runs["hyperparameters"].iloc[0]
+            start = [name, source_of(name), variant.name, settings, str(length), str(len(scores)), str(lost)]
             rows.append((*start, *numbers, paper, *printed))
     return TextTable(header, tuple(rows), "")

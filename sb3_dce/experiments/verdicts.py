@@ -15,8 +15,8 @@ import numpy as np
 from sb3_dce.configuration import row_of
 from sb3_dce.dce_probe import PROBE_BETAS
 from sb3_dce.execution import UPDATES_WORTH_COMPILING
-from sb3_dce.experiments.curves import probe_difference
-from sb3_dce.experiments.evidence import GAMMA, TAU, Evidence
+from sb3_dce.experiments.curves import probe_difference, view_of
+from sb3_dce.experiments.evidence import GAMMA, TAIL, TAU, Evidence
 from sb3_dce.experiments.grid import Variant, source_of
 from sb3_dce.experiments.judging import (
     CLOSE,
@@ -70,13 +70,17 @@ def _second_halves(evidence: Evidence, names: list[str], measure: Callable[[np.n
     if dataset_id is not None and (evidence.n_updates(dataset_id) or 0) < 2 * SETTLED:
         return values
     for name in names:
-        curve = None if dataset_id is None else evidence.curve(evidence.experiment.variant(name), dataset_id, "q_data")
-        if curve is not None and len(curve) >= 2 * FEWEST_POINTS:
-            values[name] = measure(curve.mean(axis=1).to_numpy()[len(curve) // 2 :])
+        if dataset_id is not None and (n_updates := evidence.n_updates(dataset_id)) is not None:
+            curve = evidence.curve(evidence.experiment.variant(name), dataset_id, "q_data")
+            half = curve[curve.index > n_updates / 2]
+            if len(half) >= FEWEST_POINTS and half.index[-1] == n_updates:  # else all of its seeds diverged before
+                values[name] = measure(half.mean(axis=1).to_numpy())
     return values
 
 
 def _shape_text(values: Values, digits: int) -> str:
+    if not values.scope:
+        return ""
     return values.text(digits) or f"needs runs of {2 * SETTLED:,} steps: for half as many Q is on the way to its level"
 
 
@@ -140,7 +144,7 @@ def _shift(evidence: Evidence) -> list[Verdict]:
             if dataset_id is None:
                 continue
             lowered, theory = evidence.shift(experiment.variant(name), experiment.variant("beta 0"), dataset_id, of)
-            late = lowered.index > 0.9 * (evidence.n_updates(dataset_id) or 0)
+            late = lowered.index > (1.0 - TAIL) * (evidence.n_updates(dataset_id) or 0)
             if lowered.empty or not late.any():
                 continue
             ratios[name] = float(lowered[late].mean().mean() / theory[late].mean())
@@ -210,19 +214,20 @@ ALPHA_STEP = student_quantile(4) * math.sqrt(2.0) * 0.043
 
 def _alpha(evidence: Evidence) -> list[Verdict]:
     experiment = evidence.experiment
-    variants = [experiment.variant(f"beta {b}") for b in (1, 2, 4)]
+    rising_betas = evidence.among([f"beta {b}" for b in (1, 2, 4)])
+    variants = rising_betas.experiment.variants
     rises: list[bool | str] = []
     texts = []
-    for dataset, name in evidence.table_rows():
+    for dataset, name in rising_betas.table_rows():
         values = Values()
-        for v in variants:
-            if v in evidence.variants(dataset) and (value := evidence.tail(v, name, "ent_coef")) is not None:
+        for v in rising_betas.variants(dataset):
+            if (value := rising_betas.tail(v, name, "ent_coef")) is not None:
                 values[v.name] = value
         if len(values) > 1 and not dataset.is_other_kind(name):
             logs = np.diff(np.log(list(values.values())))
             risen = len(values) == len(variants) and bool((logs > ALPHA_STEP).all())
             rises.append(False if (logs < -ALPHA_STEP).any() else True if risen else CLOSE)
-            values.scope = evidence.scope(name, variants)
+            values.scope = rising_betas.scope(name, variants)
             texts.append(values.text(4))
     rule = (
         f"on every set with runs alpha of beta 1 < 2 < 4, each step by more than {math.exp(ALPHA_STEP) - 1:.0%}, which seeds "
@@ -233,15 +238,16 @@ def _alpha(evidence: Evidence) -> list[Verdict]:
     beta4 = experiment.variant("beta 4")
     for panel in experiment.panels:
         if panel.over:
-            alphas, names = Values(), [name for name in map(evidence.id_of, panel.over) if name is not None]
+            view = view_of(evidence, panel)
+            alphas, names = Values(), [name for name in map(view.id_of, panel.over) if name is not None]
             for name in names:
-                value = evidence.tail(beta4, name, "ent_coef")
+                value = view.tail(beta4, name, "ent_coef")
                 if value is not None:
                     alphas[name] = value
             # what the claim is about are tasks: data of another kind than the paper's say nothing on it
-            kinds = [evidence.other_kind(paper) for paper in panel.over if evidence.id_of(paper) in alphas]
+            kinds = [view.other_kind(paper) for paper in panel.over if view.id_of(paper) in alphas]
             alphas.other_kind = next((kind for kind in kinds if kind), "")
-            alphas.scope = lengths_and_seeds(evidence, beta4, list(alphas))
+            alphas.scope = lengths_and_seeds(view, beta4, list(alphas))
             spread = None
             complete = len(alphas) == len(panel.over)
             if complete or len({name.partition("-")[0] for name in alphas}) > 1:  # the claim is about tasks
@@ -287,7 +293,7 @@ def _tau(evidence: Evidence) -> list[Verdict]:
 def _range_by_chance(errors: list[Uncertainty]) -> float:
     freedom = SEED_STD_FREEDOM if any(each.borrowed for each in errors) else sum(each.freedom for each in errors)
     quantile = RANGE_OF_FIVE[max(known for known in RANGE_OF_FIVE if known <= max(freedom, SEED_STD_FREEDOM))]
-    return quantile * float(np.mean([each.error for each in errors]))
+    return quantile * math.sqrt(float(np.mean([each.error**2 for each in errors])))  # pooled
 
 
 # Two spreads of one curve each are called different beyond this factor.
@@ -346,6 +352,8 @@ def _sac(evidence: Evidence) -> list[Verdict]:
                 text += f"; needs runs of {SETTLED:,} steps: before, Q is on the way to its level"
         elif _lost(view, names[0]) and view.curve(view.experiment.variant(names[1]), data or "", "q_data").size:
             lower = not _lost(view, names[1])
+            scope = view.scope(data or "", view.experiment.variants)
+            text = f"{names[0]} diverged, {names[1]} {'did not' if lower else 'did, too'} ({scope})"
         rule = f"Q of SAC with V below half of that of SAC, or SAC diverges and this does not ({TENTH})"
         claim = f"V alone makes Q far lower (paper: 4000 and 400), {alpha}"
         found.append(judge(claim, rule, lower, text))
@@ -371,17 +379,21 @@ def _sac(evidence: Evidence) -> list[Verdict]:
 
 
 def _alpha_return(evidence: Evidence) -> list[Verdict]:
-    def of(*names: str) -> Values | None:
-        return values_of(evidence, list(names), "score")
-
     agents = ("DCE", "Eq. 18")
-    both = of("DCE, alpha 3", "Eq. 18, alpha 3")
-    pairs = [of(f"{agent}, alpha 1", f"{agent}, alpha 3") for agent in agents]
-    works, fails = of("DCE, alpha 1", "DCE, alpha 5"), of("Eq. 18, alpha 1", "Eq. 18, alpha 5")
+    both = values_of(evidence, ["DCE, alpha 3", "Eq. 18, alpha 3"], "score")
+
+    def with_alpha(alpha: int) -> tuple[Evidence, list[Values | None]]:
+        """Each agent at alpha 1 and at this alpha, all of one length."""
+        names = [[f"{agent}, alpha {value}" for value in (1, alpha)] for agent in agents]
+        view = evidence.of_one_length([name for pair in names for name in pair])
+        return view, [values_of(view, pair, "score") for pair in names]
+
+    _, pairs = with_alpha(3)
+    view, (works, fails) = with_alpha(5)
     outcome: bool | str | None = None
     if works is not None and works["DCE, alpha 1"] > WORKING:
         dce_works = works["DCE, alpha 5"] >= max(WORKING, 0.5 * works["DCE, alpha 1"])
-        if _lost(evidence, "Eq. 18, alpha 5"):
+        if _lost(view, "Eq. 18, alpha 5"):
             outcome = dce_works
         elif fails is not None and fails["Eq. 18, alpha 1"] > WORKING:
             halved = fails["Eq. 18, alpha 5"] < 0.5 * fails["Eq. 18, alpha 1"]
@@ -483,7 +495,7 @@ def _leading(evidence: Evidence) -> list[Verdict]:
         rule += "; the 5 % of the test are divided among all comparisons of the claim"
         absent = [f"{name} on {missing.count(name)} of {len(ids)} sets" for name in sorted(set(missing))]
         numbers = "; ".join(_by_scope(evidence, agents, places))
-        numbers = (f"place of DCE: {numbers}" if numbers else "DCE was not run") + (
+        numbers = (f"place of DCE: {numbers}" if numbers else "no runs of DCE as long as those of the others") + (
             f"; without runs of this length: {', '.join(absent)}" if absent else ""
         )
         found.append(judge(claim, rule, holds, numbers))
@@ -541,38 +553,42 @@ FEWEST_SEEDS = 3
 def _adroit(evidence: Evidence) -> list[Verdict]:
     experiment = evidence.experiment
     with_, without = experiment.variant("DCE"), experiment.variant("DCE without dropout")
+    view = evidence.among([with_.name, without.name])
     pairs: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    wide: dict[str, np.ndarray] = {}
     ups: list[bool | str] = []
-    for dataset, name in evidence.table_rows():
-        scores = [evidence.last(v, name) for v in (with_, without)]
-        same_kind = not dataset.is_other_kind(name)
-        human = dataset.paper in (without.datasets or ()) and same_kind
-        n_runs = [evidence.runs(v, name)["seed"].nunique() for v in (with_, without)]
-        if human and all(n_runs):
-            pairs[name] = (scores[0], scores[1])
-            lost = [evidence.n_diverged(v, name) > 0 for v in (with_, without)]
-            if min(n_runs) >= FEWEST_SEEDS and any(lost):  # what diverges on a seed has failed
-                ups += [lost[1]] if lost[0] != lost[1] else []
-            elif min(map(len, scores)) >= FEWEST_SEEDS:
-                spread = [uncertainty(evidence, each, name) for each in scores]
-                ups.append(differs(float(scores[0].mean() - scores[1].mean()), spread[0], spread[1]))
-        if same_kind and len(scores[0]) > 1 and not isinstance(row_of(with_.algo, name)["ent_coef"], str):
-            wide[name] = scores[0]
+    for dataset, name in view.table_rows():
+        n_runs = [view.runs(v, name)["seed"].nunique() for v in (with_, without)]
+        if dataset.paper in (without.datasets or ()) and not dataset.is_other_kind(name) and all(n_runs):
+            pairs[name] = (view.last(with_, name), view.last(without, name))
+    for name, scores in pairs.items():
+        lost = [view.n_diverged(v, name) > 0 for v in (with_, without)]
+        n_runs = [view.runs(v, name)["seed"].nunique() for v in (with_, without)]
+        if min(n_runs) >= FEWEST_SEEDS and any(lost):  # what diverges on a seed has failed
+            ups += [lost[1]] if lost[0] != lost[1] else []
+        elif min(map(len, scores)) >= FEWEST_SEEDS:
+            spread = [uncertainty(evidence, each, name) for each in scores]
+            ups.append(differs(float(scores[0].mean() - scores[1].mean()), spread[0], spread[1], len(pairs)))
     numbers = ", ".join(
-        f"{name}: {_mean_of(a)} with, {_mean_of(b)} without ({evidence.scope(name, [with_, without])})"
+        f"{name}: {_mean_of(a)} with, {_mean_of(b)} without ({view.scope(name, [with_, without])})"
         for name, (a, b) in pairs.items()
     )
     holds = None if not ups else False if False in ups else True in ups or CLOSE
     rule = (
         f"clearly higher mean score with dropout 0.1 on a set of people's demonstrations, on none clearly lower; with "
-        f"{FEWEST_SEEDS} seeds or more, since these scores spread by up to 37 in the paper"
+        f"{FEWEST_SEEDS} seeds or more, since these scores spread by up to 37 in the paper; the 5 % of the test are divided "
+        "among the sets"
     )
+    wide: dict[str, np.ndarray] = {}
+    scopes: dict[str, str] = {}
+    for dataset, name in evidence.table_rows():
+        most = evidence.last_of_most_seeds(with_, name)
+        constant = not isinstance(row_of(with_.algo, name)["ent_coef"], str)
+        if constant and not dataset.is_other_kind(name) and most is not None and len(most[0]) > 1:
+            wide[name], scopes[name] = most[0], f"{most[1]:,} steps, {len(most[0])} seeds"
     found = [judge("Dropout of the critics helps on human demonstrations", rule, holds, numbers)]
     sources = {source_of(name) for name in wide}
     wide = {name: scores for name, scores in wide.items() if source_of(name) == min(sources)}  # "D4RL" before "sb3"
-    spreads = Values((name, sample_std(scores)) for name, scores in wide.items())
-    spreads.scope = lengths_and_seeds(evidence, with_, list(spreads))
+    spreads = Values((f"{name}, {scopes[name]}", sample_std(scores)) for name, scores in wide.items())
     large = spreads_beyond(wide, 15.0, "pen-human")  # on the other sets the paper's own deviations are below 15
     rule = (
         f"of the sets with a constant alpha and {PAPER_SEEDS} seeds or more, on some the 95 % interval of the standard "
