@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
@@ -56,7 +57,7 @@ def list_datasets(
     for spec in all_specs():
         if spec.id in here or all_:
             where = "comes with the package" if spec.embedded else str(here.get(spec.id, "not on this machine"))
-            table.add_row(spec.id, spec.env_id or "none today", str(spec.obs_dim), str(spec.act_dim), where)
+            table.add_row(spec.id, spec.env_id or "none today", str(spec.obs_dim), str(spec.act_dim), escape(where))
     console.print(table)
     if not all_:
         console.print(f"[dim]--all shows the others. Put files into a folder named in ${DATASETS_VARIABLE}.[/dim]")

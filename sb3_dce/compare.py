@@ -28,7 +28,7 @@ from sb3_dce.files import write_text
 from sb3_dce.hyperparams import check_keys, full_name
 from sb3_dce.launch import launch_all, raise_first
 from sb3_dce.plots import plot_learning_curves
-from sb3_dce.run_files import RunSpec, last_metrics, read_config, read_divergence, read_result
+from sb3_dce.run_files import RunSpec, last_metrics, read_config, read_divergence, read_result, spec_from
 from sb3_dce.runs import check_before_running
 from sb3_dce.student import sample_std
 
@@ -109,7 +109,8 @@ def compare(
     path, _ = find_file(dataset)
     name, folder = short_name(dataset), out or default_folder(dataset)
     console.print(
-        f"[b]{', '.join(algos)}[/b] on [b]{name}[/b] ({path}), {n_updates:,} gradient steps, seeds {list(seeds)}, last policy"
+        f"[b]{', '.join(algos)}[/b] on [b]{escape(name)}[/b] ({escape(str(path))}), {n_updates:,} gradient steps, "
+        f"{escape(f'seeds {list(seeds)}')}, last policy"
     )
     specs = [
         RunSpec(
@@ -157,14 +158,14 @@ def report(dataset: str, algos: Sequence[str], out: Path | None, console: Consol
         if result is None and read_divergence(path) is None:
             continue
         # a complete run may be on its way to become a longer one
-        spec = RunSpec(**(config["run"] if result is None else result["config"]), folder=str(path))
+        spec = spec_from(config["run"] if result is None else result["config"], path)
         if config["dataset"]["sha256"] != sha256_once(find_file(dataset)[0]):
             what = f"trained on another file ({config['dataset']['name']}) than {dataset}"
             raise ConfigError(what, where=str(path), hint="Name that one, or another folder with --out.")
         how = f"{spec.n_updates:,} updates{''.join(f', {k}={v}' for k, v in sorted(spec.overrides.items()))}"
         how += f", evaluated over {spec.n_eval_episodes} episodes every {spec.eval_freq:,}"
         # another version of the row of hyperparameters is another agent
-        row = config_hash(spec.algo, config.get("hyperparameters", {}))
+        row = config_hash(spec.algo, config["hyperparameters"])
         runs.setdefault(spec.algo, {}).setdefault((how, row), []).append(spec)
     chosen = []
     for algo, kinds in runs.items():

@@ -198,9 +198,8 @@ class Population:
             return numbers % self._lengths[:, None], noise
         indices, noises = [], []
         for model in self.models:  # in the order of OfflineAlgorithm.train
-            generator, buffer = model._training_generator(), model.replay_buffer
-            assert isinstance(buffer, OfflineReplayBuffer)
-            indices.append(th.randint(buffer.size(), (batch_size,), generator=generator, device=model.device))
+            generator = model._training_generator()
+            indices.append(model.draw_rows(generator, batch_size))
             noises.append({name: spec.draw(generator, model.device, self._dtype) for name, spec in specs.items()})
         stacked = tree_map(lambda *draws: th.stack(draws).to(self.device), *noises) if specs else {}
         return th.stack(indices).to(self.device), stacked

@@ -184,7 +184,7 @@ class BatchedRuns:
 
     def _population(self) -> Population:
         agent, state = agent_class(self.specs[0].algo), self._state_path
-        saved = th.load(state, weights_only=True) if state.is_file() else None
+        saved = self._saved_state()
         self._diverged = {} if saved is None else dict(saved.get("diverged", {}))
         models: list[OfflineAlgorithm] = []
         for index, (spec, folder) in enumerate(zip(self.specs, self.folders, strict=True)):
@@ -209,6 +209,22 @@ class BatchedRuns:
             write_config(spec, model, folder, self._device, len(models))
             self._loggers.append(make_logger(spec, model, folder))
         return population
+
+    def _saved_state(self) -> dict[str, Any] | None:
+        """Where these runs were interrupted, ``None`` if there is nothing to go on with."""
+        if not self._state_path.is_file():
+            return None
+        members = members_to_go_on(self._state_path)
+        if not members:
+            text = f"{self._state_path} is damaged, or a checkpoint has gone: its runs begin anew"
+            self.console.print(text, markup=False, soft_wrap=True)
+            self._state_path.unlink()
+            return None
+        if members != self.folders:
+            names = ", ".join(folder.name for folder in members)
+            hint = "Give these runs, in this order, or choose another folder or state_file."
+            raise CheckpointError(f"the file is that of a population of {names}", where=str(self._state_path), hint=hint)
+        return dict(th.load(self._state_path, weights_only=True))
 
     def _say_memory(self, population: Population) -> None:
         memory = {name: size / 2**20 for name, size in population.memory().items()}

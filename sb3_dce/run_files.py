@@ -134,9 +134,27 @@ def read_config(folder: Path) -> dict[str, Any] | None:
     """
     :param folder: folder of a run
     :return: its ``config.yml``, ``None`` if it has not begun
-    :raises CheckpointError: if the file is damaged
+    :raises CheckpointError: if the file is damaged, or another program's
     """
-    return _read(folder / "config.yml", yaml.safe_load)
+    config = _read(folder / "config.yml", yaml.safe_load, ("run", "dataset", "hyperparameters"))
+    if config is not None and not all(isinstance(config[name], dict) for name in ("run", "dataset", "hyperparameters")):
+        raise _not_of_a_run(folder / "config.yml")
+    return config
+
+
+def spec_from(settings: dict[str, Any], folder: Path) -> RunSpec:
+    """
+    :param settings: of a run, as its files have them
+    :param folder: where they are
+    :return: the run
+    :raises CheckpointError: if it has settings that this version does not know, or lacks some
+    """
+    try:
+        return RunSpec(**settings, folder=str(folder))
+    except TypeError as error:
+        raise CheckpointError(
+            f"the run was made with another version of this package: {error}", where=str(folder), path=folder, hint=BEGIN_ANEW
+        ) from error
 
 
 def _read(path: Path, parse: Callable[[str], Any], keys: Sequence[str] = ()) -> dict[str, Any] | None:
@@ -149,8 +167,12 @@ def _read(path: Path, parse: Callable[[str], Any], keys: Sequence[str] = ()) -> 
         raise CheckpointError("the file is damaged", where=str(path), path=path, hint=BEGIN_ANEW) from error
     complete = isinstance(content, dict) and all(key in content for key in keys)
     if not complete or ("n_updates" in keys and not isinstance(content["n_updates"], int)):
-        raise CheckpointError("the file is not that of a run", where=str(path), path=path, hint=BEGIN_ANEW)
+        raise _not_of_a_run(path)
     return content
+
+
+def _not_of_a_run(path: Path) -> CheckpointError:
+    return CheckpointError("the file is not that of a run", where=str(path), path=path, hint=BEGIN_ANEW)
 
 
 def write_result(spec: RunSpec, folder: Path, evaluations: list[Evaluation], seconds: float) -> dict[str, Any]:

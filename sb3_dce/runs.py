@@ -188,8 +188,7 @@ def refuse_other_run(spec: RunSpec, folder: Path) -> None:
     config = read_config(folder)
     if config is None:
         return
-    parts = (config.get(name) for name in ("run", "dataset", "hyperparameters"))
-    begun, data, settings = (part if isinstance(part, dict) else {} for part in parts)
+    begun, data, settings = (config[name] for name in ("run", "dataset", "hyperparameters"))
     wanted = plain(settings_of_run(spec))
     del wanted["dataset"]
     if _reached(folder) <= spec.n_updates and not _depends_on_length(settings):

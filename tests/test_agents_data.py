@@ -278,9 +278,11 @@ def test_evaluation_environment_may_be_normalised_too(
     agent: Agent, transitions: Transitions, make_point_mass: Callable[[], gym.Env]
 ) -> None:
     env, eval_env = (VecNormalize(DummyVecEnv([make_point_mass]), norm_reward=False) for _ in range(2))
+    eval_env.training = False
     callback = EvalCallback(eval_env, eval_freq=2, n_eval_episodes=1, verbose=0, warn=False)
     model = make(agent, env=env, dataset=transitions, normalize_obs=False)
     assert model.learn(4, callback, log_interval=None).num_timesteps == 4
+    assert np.array_equal(eval_env.obs_rms.mean, env.obs_rms.mean) and not np.array_equal(env.obs_rms.mean, np.zeros(5))
 
 
 def test_fresh_observation_statistics_are_taken_from_the_data(

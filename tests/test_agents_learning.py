@@ -118,22 +118,37 @@ def test_training_never_steps_its_environment(agent: Agent, transitions: Transit
     assert make(agent, env=spaces_env, dataset=transitions).learn(3).num_timesteps == 3
 
 
+class CountedRollouts(BaseCallback):
+    """Counts the calls around rollouts, of which there are none."""
+
+    n_rollouts = 0
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        self.n_rollouts += 1
+
+    _on_rollout_end = _on_rollout_start
+
+
 def test_usual_callbacks_work_together(
     agent: Agent, transitions: Transitions, tmp_path: Path, make_point_mass: Callable[[], gym.Env]
 ) -> None:
-    every = Recorder()
+    every, rollouts = Recorder(), CountedRollouts()
     callbacks = CallbackList(
         [
             CheckpointCallback(4, str(tmp_path), save_replay_buffer=False),
             EveryNTimesteps(3, every),
-            StopTrainingOnMaxEpisodes(100),
+            StopTrainingOnMaxEpisodes(1),  # there are no episodes that could end it
+            rollouts,
             EvalCallback(make_point_mass(), eval_freq=6, n_eval_episodes=1, log_path=str(tmp_path), verbose=0, warn=False),
             ProgressBarCallback(),
         ]
     )
     model = make(agent, dataset=transitions).learn(12, callbacks)
     assert sorted(p.name for p in tmp_path.glob("*.zip")) == [f"rl_model_{n}_steps.zip" for n in (12, 4, 8)]
-    assert [n for n, _ in every.seen] == [3, 6, 9, 12]
+    assert [n for n, _ in every.seen] == [3, 6, 9, 12] and rollouts.n_rollouts == 0
     assert np.load(tmp_path / "evaluations.npz")["timesteps"].tolist() == [6, 12]
     checkpoint = agent.cls.load(tmp_path / "rl_model_12_steps.zip")
     assert same(weights(model), weights(checkpoint))

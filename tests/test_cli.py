@@ -8,11 +8,14 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
+import typer
 import yaml
 from commands import Outcome, sb3_dce
 from typer.testing import CliRunner
@@ -253,11 +256,19 @@ def test_datasets_info_says_what_is_in_a_file() -> None:
     assert "5,000 rows" in result.stdout and "returns min -217.2" in result.stdout and "sha256" in result.stdout
 
 
-@pytest.mark.parametrize("command", [[], ["demo"], ["train"], ["evaluate"], ["datasets"], ["datasets", "info"]])
-def test_help_reads_well(command: list[str]) -> None:
-    result = CliRunner().invoke(cli.app, [*command, "--help"])
-    assert result.exit_code == 0
-    assert "Usage" in result.output
+def _commands(group: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    yield path, group
+    for name, command in getattr(group, "commands", {}).items():
+        yield from _commands(command, (*path, name))
+
+
+def test_every_command_and_option_has_help() -> None:
+    commands = dict(_commands(typer.main.get_command(cli.app)))
+    assert len(commands) > 12
+    for path, command in commands.items():
+        result = CliRunner().invoke(cli.app, [*path, "--help"])
+        assert result.exit_code == 0 and "Usage" in result.output and command.help, path
+        assert all(option.help for option in command.params if option.name != "help"), path
 
 
 def test_overrides_are_read_as_yaml_without_evaluation() -> None:

@@ -91,18 +91,20 @@ def test_iql_normalisation_divides_by_the_range_of_returns(transitions: Transiti
     assert model.coefficients(0)["reward_scale"] == pytest.approx(2000.0 / (returns.max() - returns.min()), rel=1e-9)
 
 
-def test_long_run_after_a_short_one_is_compiled(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
-    """``execution="auto"`` decides by the updates of the run at hand, not by those of the first one."""
-    planned: list[int] = []
-
-    def choose(execution: str, planned_updates: int, device: th.device) -> str:
-        planned.append(planned_updates)
-        return "eager"
-
-    monkeypatch.setattr("sb3_dce.base.choose_execution", choose)
-    model = make(DCE, dataset=transitions, execution="auto").learn(2)
+def test_long_run_after_a_short_one_is_compiled(
+    transitions: Transitions, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """``execution="auto"`` decides by the updates of the run at hand; what is compiled stays so."""
+    monkeypatch.setattr("sb3_dce.base.choose_execution", lambda _, n, device: "compile" if n > 10_000 else "eager")
+    monkeypatch.setattr(th, "compile", lambda function, **_: function)  # which way is taken, not what it does
+    model = make(DCE, dataset=transitions, execution="auto", verbose=1).learn(3, log_interval=None)
+    sums = model._engine.metrics
+    assert model._engine.execution == "eager"
     model.learn(100_000, Recorder(stop_at=2), log_interval=None)
-    assert max(planned) == 100_000
+    assert model._engine.execution == "compile" and model._engine.metrics is sums
+    model.learn(1, log_interval=None)
+    assert model._engine.execution == "compile"
+    assert capsys.readouterr().out.count("Preparing the update") == 1
 
 
 def test_divergence_is_noticed_at_the_end_of_a_short_run(transitions: Transitions) -> None:

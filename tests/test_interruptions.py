@@ -10,20 +10,25 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import pandas as pd
 import pytest
 import yaml
 from commands import sb3_dce
+from rich.console import Console
 from update_tools import all_tensors, largest_difference
 
-from sb3_dce import OfflineDCE, OfflineIQL, configuration
+from sb3_dce import OfflineDCE, OfflineIQL, configuration, launch
 from sb3_dce.data import find_file
-from sb3_dce.errors import ConfigError
+from sb3_dce.errors import CheckpointError, ConfigError
 from sb3_dce.evaluation import read_evaluations
 from sb3_dce.experiments import results
+from sb3_dce.launch import RunFailedError, train_one
 from sb3_dce.run_files import RunSpec, read_result, write_divergence
 from sb3_dce.runs import StoppedError, check_before_running, run
 from sb3_dce.saving import saved_timesteps
@@ -123,6 +128,43 @@ def test_settings_that_no_training_can_have_leave_nothing(overrides: dict[str, A
     settings = [text for key, value in wrong.overrides.items() for text in ("--set", f"{key}={json.dumps(value)}")]
     outcome = sb3_dce(*command, *settings, "--out", str(tmp_path / "out"))
     assert outcome.code == 2 and "Traceback" not in outcome.stderr and not (tmp_path / "out").exists()
+
+
+def test_unexpected_error_of_a_run_is_one_line_and_a_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_dce.launch.runs.run", lambda *_: 1 / 0)
+    with pytest.raises(RunFailedError, match=r"ZeroDivisionError.*error\.txt") as caught:
+        train_one(spec(tmp_path, 10), lambda progress: None)
+    assert "Traceback" not in str(caught.value) and "Traceback" in (tmp_path / "error.txt").read_text()
+
+
+def test_second_ctrl_c_does_not_wait(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    begun: Future[None] = Future()
+    begun.set_running_or_notify_cancel()
+    asked: list[bool] = []
+    monkeypatch.setattr("sb3_dce.launch.wait", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    launch._save_and_end([begun], SimpleNamespace(save_and_end=lambda: asked.append(True)), Console(width=200))
+    assert asked and "goes on from the last checkpoints" in capsys.readouterr().out
+
+
+def test_damaged_checkpoint_says_what_to_delete(tmp_path: Path) -> None:
+    with pytest.raises(StoppedError):
+        run(spec(tmp_path, 30), stop=after(12))
+    checkpoint = tmp_path / "checkpoint.zip"
+    whole = checkpoint.read_bytes()
+    checkpoint.write_bytes(whole[:-300])
+    with pytest.raises(CheckpointError, match="Delete it to go on without"):
+        run(spec(tmp_path, 30))
+    checkpoint.write_bytes(whole)
+    assert run(spec(tmp_path, 30))["n_updates"] == 30
+
+
+def test_seconds_of_the_parts_of_a_run_add_up(tmp_path: Path) -> None:
+    with pytest.raises(StoppedError):
+        run(spec(tmp_path, 30), stop=after(12))
+    log = pd.read_csv(tmp_path / "progress_0.csv")
+    log["time/time_elapsed"] += 1000
+    log.to_csv(tmp_path / "progress_0.csv", index=False)
+    assert 1000 <= run(spec(tmp_path, 30))["seconds"] < 2000
 
 
 def test_seed_that_diverges_ends_no_other(tmp_path: Path) -> None:

@@ -35,7 +35,7 @@ from sb3_dce.experiments.probe import prepare_probe
 from sb3_dce.experiments.reproduce import Request, plan_runs, reproduce, scale_of
 from sb3_dce.experiments.run import execute, is_complete, population_file, populations
 from sb3_dce.population_runs import BatchedRuns
-from sb3_dce.run_files import RunSpec, read_divergence, write_result
+from sb3_dce.run_files import RunSpec, read_divergence, write_divergence, write_result
 from sb3_dce.runs import run
 from sb3_dce.training import load_any
 
@@ -285,6 +285,38 @@ def test_population_whose_checkpoints_have_gone_is_none_to_go_on_with(
     (tmp_path / "runs" / "population-damaged.pt").write_bytes(b"no state")
     train(plan, device="cuda")
     assert trained == [7, 4, 3] and all(is_complete(r.spec) for r in plan)
+
+
+def test_probe_of_a_run_that_diverged_is_not_begun(tmp_path: Path) -> None:
+    dce, probe = small_plan("fig-ood", tmp_path)
+    folder = Path(dce.spec.folder)
+    folder.mkdir(parents=True)
+    write_divergence(folder, 3, "q_data not finite")
+    (error,) = train([dce, probe])
+    assert "needs the last policy" in str(error) and not Path(probe.spec.folder).exists()
+
+
+def test_large_agents_are_trained_in_smaller_populations() -> None:
+    specs = [RunSpec("offline_uwac", TINY, seed, 4, f"runs/{seed}") for seed in range(7)]
+    assert sorted(map(len, populations(specs))) == [2, 5]
+
+
+@pytest.mark.parametrize("harm", ["state", "checkpoint"])
+def test_population_that_cannot_go_on_begins_anew(
+    harm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trained: list[int]
+) -> None:
+    plan = [r for r in small_plan("fig-beta", tmp_path, updates=4) if r.spec.algo == "dce"]
+    with monkeypatch.context() as patch:
+        patch.setattr(BatchedRuns, "_finish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            train(plan, device="cuda")
+    (state,) = (tmp_path / "runs").glob("*.pt")
+    if harm == "state":
+        state.write_bytes(b"no state")
+    else:
+        (Path(plan[0].spec.folder) / "checkpoint_4.zip").unlink()
+    train(plan, device="cuda")
+    assert all(is_complete(r.spec) for r in plan) and not state.exists()
 
 
 def test_population_of_a_figure_writes_what_its_processes_would_write(tmp_path: Path) -> None:

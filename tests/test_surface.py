@@ -28,7 +28,7 @@ from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 
 import sb3_dce as package
-from sb3_dce import OfflineBC, OfflineDCE, OfflineSACV, OfflineTD3BC, OfflineUWAC, Transitions, agents
+from sb3_dce import OfflineBC, OfflineDCE, OfflineSAC, OfflineSACV, OfflineTD3BC, OfflineUWAC, Transitions, agents
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.data import load_transitions
 from sb3_dce.envs import SpacesEnv, own_env, without_bookkeeping
@@ -434,6 +434,19 @@ def test_an_interrupted_population_keeps_what_it_has(transitions: Transitions, m
     other.train(3)
     for p, q in zip(models[0].policy.parameters(), other.models[0].policy.parameters(), strict=True):
         assert th.equal(p, q)
+
+
+@pytest.mark.parametrize("cls", [OfflineSAC, OfflineDCE])
+def test_networks_go_on_online_in_sac(cls: Any, transitions: Transitions, make_point_mass: Any) -> None:
+    """As the FAQ says; ``strict=False`` would hide a network with another name."""
+    kwargs = {"policy_kwargs": {"net_arch": [8]}, "device": "cpu"}
+    model = cls("MlpPolicy", dataset=transitions, seed=0, batch_size=16, **kwargs).learn(3)
+    sac = SAC("MlpPolicy", make_point_mass(), learning_starts=2, batch_size=4, seed=1, **kwargs)
+    assert sac.policy.load_state_dict(model.policy.state_dict(), strict=False).missing_keys == []
+    obs = transitions.observations[:9]
+    first, second = (agent.predict(obs, deterministic=True)[0] for agent in (sac, model))
+    assert np.allclose(first, second, atol=1e-6)
+    assert sac.learn(5).num_timesteps == 5
 
 
 # -- examples ----------------------------------------------------------------------------------------------------------

@@ -301,9 +301,6 @@ def test_dropout_is_for_training_only(transitions: Transitions) -> None:
     obs = transitions.observations[:50]
     for _ in range(2):
         assert np.array_equal(plain.predict(obs, deterministic=True)[0], dropped.predict(obs, deterministic=True)[0])
-    plain.learn(2), dropped.learn(2)
-    assert largest_difference(plain.critic.state_dict(), dropped.critic.state_dict()) > 0.0  # other batches are drawn
-    assert largest_difference(plain.actor.state_dict(), dropped.actor.state_dict()) > 0.0
 
 
 # -- numbers -----------------------------------------------------------------------------------------------------------

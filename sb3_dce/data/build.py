@@ -144,7 +144,7 @@ def build_rows(
                 count=n_bad,
             )
         _require_rows(used, where)
-    _check_content(rows, layout, summaries, sources, findings)
+    _check_content(summaries, sources, findings)
     actions = check_actions(rows[:, layout.actions], summaries["actions"], options, findings, where, spec)
     rewards = _reward_facts(rows[:, layout.rewards.start], episodes, used)
     whole = _whole_episodes(episodes, rewards.returns, bad)
@@ -233,13 +233,7 @@ def _require_rows(used: np.ndarray, where: str) -> None:
         )
 
 
-def _check_content(
-    rows: np.ndarray,
-    layout: RowLayout,
-    summaries: Mapping[str, ColumnSummary],
-    sources: Mapping[str, ArraySource],
-    findings: Findings,
-) -> None:
+def _check_content(summaries: Mapping[str, ColumnSummary], sources: Mapping[str, ArraySource], findings: Findings) -> None:
     check_observations(summaries["observations"], sources["observations"].dtype.kind in "iu", findings)
     if (kind := sources["actions"].dtype).kind in "iub":
         findings.warning(

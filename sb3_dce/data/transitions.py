@@ -135,7 +135,7 @@ class Transitions:
         if episodes is not None:
             sources[EPISODES] = numbered(as_array(episodes, EPISODES))
         dataset_id = spec.id if spec else "arrays"
-        return cls._build(sources, dataset_id, None, sources, spec, ReadOptions.of(options))
+        return cls._build(sources, dataset_id, sources, spec, ReadOptions.of(options))
 
     @classmethod
     def from_npz(cls, path: str | PathLike[str], *, spec: DatasetSpec | None = None, **options: Any) -> Transitions:
@@ -250,7 +250,7 @@ class Transitions:
         bounds = {"action_low": np.ravel(space.low), "action_high": np.ravel(space.high)}
         spec = options.pop("spec", None)
         dataset_id = spec.id if spec else "arrays"
-        return cls._build(arrays, dataset_id, None, CORE_KEYS, spec, ReadOptions.of({**bounds, **options}))
+        return cls._build(arrays, dataset_id, CORE_KEYS, spec, ReadOptions.of({**bounds, **options}))
 
     @classmethod
     def from_minari(cls, name: str | PathLike[str], *, flatten: Flatten = False, **options: Any) -> Transitions:
@@ -316,12 +316,11 @@ class Transitions:
         cls,
         sources: Mapping[str, ArraySource],
         dataset_id: str,
-        path: Path | None,
         found_keys: Any,
         spec: DatasetSpec | None,
         options: ReadOptions,
     ) -> Transitions:
-        built = build_rows(sources, dataset_id=dataset_id, path=path, found_keys=found_keys, spec=spec, options=options)
+        built = build_rows(sources, dataset_id=dataset_id, path=None, found_keys=found_keys, spec=spec, options=options)
         return cls._of(built)
 
     @classmethod

@@ -12,7 +12,6 @@ import hashlib
 import os
 import platform
 import socket
-import traceback
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -152,8 +151,8 @@ def train_on_node(spec: RunSpec, asker: str, sha256: str) -> Outcome:
         return Outcome(node, send(folder), str(error), diverged=True)
     except SB3DCEError as error:
         return Outcome(node, {}, str(error), diverged=False)
-    except Exception:
-        return Outcome(node, {}, traceback.format_exc(limit=-3), diverged=False)
+    except Exception as error:  # not of the run, which would have left its report in the folder
+        return Outcome(node, {}, f"{type(error).__name__}: {error}", diverged=False)
     assert read_result(folder) is not None
     return Outcome(node, send(folder), None, diverged=False)
 

@@ -147,7 +147,7 @@ class Experiment:
 
     :param id: name on the command line
     :param title: heading
-    :param items: numbers in the list of experiments
+    :param items: labels in the list of what is reproduced (E1 to E27, docs/reproduce.md)
     :param report: "table", "run-times", "figure", "bounds", "diagnosis" or "configuration"
     :param datasets: rows, in the paper's order
     :param variants: columns or lines
@@ -209,7 +209,7 @@ class PlannedRun:
 
 def experiment_ids() -> list[str]:
     """
-    :return: names of all experiments, those with runs of table 1 first
+    :return: names of all experiments, in the order of the page of results; those it does not name come last
     """
     order = ["table1", "table-adroit-kitchen", "run-times", "fig-tau", "fig-beta", "fig-ood", "fig-alpha", "fig-cql-q"]
     order += ["fig-cql-return", "fig-sac", "fig-alpha-return", "bounds", "config-tables", "why-dce-loses"]

@@ -269,7 +269,7 @@ def _from_policy(job: _Job) -> Recorded:
     extra: dict[str, Any] = {}
     if recipe.source == "policy":
         path = sources.policy or _search(job) or _train(job)
-        policy, extra = str(path), _origin(path, "behaviour")
+        policy, extra = str(path), _origin(path)
     spec = RecordingSpec(policy, recipe.dataset.id, job.base_seed, algo=sources.algo, vecnormalize=sources.vecnormalize)
     rows = job.rows or recipe.rows
     return record(
@@ -291,7 +291,7 @@ def _from_buffer(job: _Job) -> Recorded:
     path = job.sources.buffer or _search(job)
     if path is not None:
         Transitions.from_hdf5(path, spec=job.recipe.dataset)  # its checks
-        arrays, extra = _read(path), {"behaviour_policy": "not recorded", **_origin(path, "behaviour")}
+        arrays, extra = _read(path), {"behaviour_policy": "not recorded", **_origin(path)}
         extra["behaviour_file"] = path.name
         if "behaviour_source" in extra:
             extra["behaviour_policy"] = extra.pop("behaviour_source")
@@ -365,13 +365,13 @@ def _read(path: Path) -> Arrays:
         return {key: array[slice(None)] for key, array in file.select(CORE_KEYS).items()}
 
 
-def _origin(path: Path, prefix: str) -> dict[str, Any]:
+def _origin(path: Path) -> dict[str, Any]:
     """What is known about a file from its bytes; what an NPZ policy says about itself is added when it is recorded."""
     digest = file_sha256(path)
     if digest not in _ORIGINS:
-        return {f"{prefix}_sha256": digest}
+        return {"behaviour_sha256": digest}
     source, licence = _ORIGINS[digest]
-    return {f"{prefix}_sha256": digest, f"{prefix}_source": source, f"{prefix}_licence": licence}
+    return {"behaviour_sha256": digest, "behaviour_source": source, "behaviour_licence": licence}
 
 
 def _search(job: _Job) -> Path | None:
