@@ -100,14 +100,13 @@ def make(agent: Agent, **kwargs: Any) -> OfflineAlgorithm:
 
 
 def weights(model: OfflineAlgorithm) -> dict[str, th.Tensor]:
-    """Everything that training changes, copied: networks with targets, optimizers, temperature."""
+    """Everything that training changes, copied: networks with targets, optimizers, what is learned beside them."""
     found = {f"policy.{k}": v.clone() for k, v in model.policy.state_dict().items()}
     for name, state in model.get_parameters().items():
         for index, moments in state.get("state", {}).items():
             found |= {f"{name}.{index}.{k}": v for k, v in moments.items()}
-    if getattr(model, "log_ent_coef", None) is not None:
-        found["log_ent_coef"] = model.log_ent_coef.detach().clone()
-    return found
+    numbers = {name: getattr(model, name) for name in model.learned_numbers()}
+    return found | {name: number.detach().clone() for name, number in numbers.items() if number is not None}
 
 
 def same(one: dict[str, th.Tensor], other: dict[str, th.Tensor]) -> bool:

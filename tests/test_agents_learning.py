@@ -280,6 +280,17 @@ def test_update_that_diverged_is_named_with_its_row(agent: Agent, transitions: T
     assert agent.cls.load(tmp_path / "finite.zip")._n_updates == before
 
 
+def test_huge_values_of_the_batch_that_broke_a_model_are_named(transitions: Transitions) -> None:
+    model = make(AGENTS["DCE"], dataset=transitions, batch_size=2, seed=3)
+    model.attach_dataset()
+    buffer = model.replay_buffer
+    assert isinstance(buffer, OfflineReplayBuffer)
+    buffer.rows = buffer.rows.clone()
+    buffer.rows[7, buffer.obs_dim + buffer.action_dim] = 1e25  # its square is infinite
+    with pytest.raises(DivergenceError, match=r"rewards up to 1e\+25 in row 7 of the buffer"):
+        model.learn(1000)
+
+
 def break_some_rows(model: OfflineAlgorithm) -> None:
     model.attach_dataset()
     buffer = model.replay_buffer

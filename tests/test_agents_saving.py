@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
-from agents_under_test import Agent, accepts, make, same, some_observations, weights
+from agents_under_test import AGENTS, Agent, accepts, make, same, some_observations, weights
 
 from sb3_dce import OfflineDCE, Transitions
 from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError
@@ -284,6 +284,15 @@ def test_parameters_of_a_damaged_file_are_refused(transitions: Transitions, tmp_
         with pytest.raises(CheckpointError, match=message):
             model.set_parameters(tmp_path / f"{name}.zip")
     assert same(before, weights(model))
+
+
+def test_random_state_of_another_kind_of_device_begins_anew_from_the_seed(transitions: Transitions, tmp_path: Path) -> None:
+    model = make(AGENTS["BC"], dataset=transitions, seed=3).learn(2)
+    model._generator, model.rng_state = None, th.zeros(16, dtype=th.uint8)  # as large as that of CUDA
+    model.save(tmp_path / "model.zip")
+    loaded = [AGENTS["BC"].cls.load(tmp_path / "model.zip", dataset=transitions) for _ in range(2)]
+    runs = [weights(each.learn(2, reset_num_timesteps=False)) for each in loaded]
+    assert same(*runs) and loaded[0]._n_updates == 4
 
 
 @pytest.mark.parametrize(

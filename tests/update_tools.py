@@ -54,7 +54,7 @@ def to_float64(model: OfflineAlgorithm) -> OfflineAlgorithm:
 
 
 def all_tensors(model: OfflineAlgorithm) -> dict[str, th.Tensor]:
-    """Parameters, moments and temperature by name."""
+    """Parameters, moments and what is learned beside the networks, by name."""
     found: dict[str, th.Tensor] = {}
     for name in model.networks:
         net = getattr(model.policy, name)
@@ -66,10 +66,11 @@ def all_tensors(model: OfflineAlgorithm) -> dict[str, th.Tensor]:
             if optimizer is not None:
                 for moment in ("exp_avg", "exp_avg_sq"):
                     found[f"{name}.{key}.{moment}"] = optimizer.state[parameter][moment]
-    if getattr(model, "log_ent_coef", None) is not None:
-        found["log_ent_coef"] = model.log_ent_coef.detach()
-        for moment in ("exp_avg", "exp_avg_sq"):
-            found[f"log_ent_coef.{moment}"] = model.ent_coef_optimizer.state[model.log_ent_coef][moment]
+    for name, learned in model.learned_numbers().items():
+        if (number := getattr(model, name)) is not None:
+            found[name] = number.detach()
+            for moment in ("exp_avg", "exp_avg_sq"):
+                found[f"{name}.{moment}"] = getattr(model, learned.optimizer).state[number][moment]
     return found
 
 
