@@ -8,13 +8,16 @@ TORCH_OPTIONS ?=
 # two test processes where there are two cores; 0 switches pytest-xdist off
 WORKERS ?= $(shell [ "$$(getconf _NPROCESSORS_ONLN)" -ge 2 ] && echo 2 || echo 0)
 
-.PHONY: demo test lint format type check clean
+.PHONY: demo test slow lint format type check clean
 
 demo: $(STAMP)
 	$(BIN)/sb3-dce demo
 
 test: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+
+slow: $(STAMP)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m slow -n $(WORKERS) --dist loadfile
 
 lint: $(STAMP)
 	$(BIN)/ruff check .
