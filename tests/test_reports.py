@@ -576,7 +576,7 @@ def test_runs_of_a_schedule_that_parts_later_are_those_of_the_constant() -> None
         rows = run_rows(TABLE, "DCE", walker, 0, curves=curves, n_updates=n_updates)
         evidence = evidence_of(rows, "fig-alpha")
         assert (evidence.tail(alpha.variant("beta 4"), walker, "ent_coef") == 0.1) is shown
-        assert len(evidence.runs(alpha.variant("beta 2"), walker)) == 0
+        assert len(evidence.rows_of(alpha.variant("beta 2"), walker)) == 0
         assert (len(evidence_of(rows).last(TABLE.variant("DCE one setting"), walker)) == 1) is shown
     own = run_rows(alpha, "beta 4", walker, 0, curves={"ent_coef": [0.3] * 10}, n_updates=50_000)
     rows = results.merge([run_rows(TABLE, "DCE", walker, 0, curves=curves, n_updates=50_000), own])

@@ -66,7 +66,7 @@ def diagnostics_table(evidence: Evidence) -> TextTable:
     dce = evidence.experiment.variant("DCE")
     rows = []
     for _, name in evidence.table_rows():
-        if not len(evidence.runs(dce, name)):
+        if not len(evidence.rows_of(dce, name)):
             continue
         terminals, reward = (evidence.start(dce, name, f"data_{what}") for what in ("n_terminals", "reward_mean"))
         half, end = halves(evidence, dce, name)
@@ -87,7 +87,7 @@ def diagnostics_table(evidence: Evidence) -> TextTable:
 def _caption(evidence: Evidence, *agents: Variant) -> str:
     """These tables show nothing of another length than the row's but what a finding names."""
     variants = list(agents or evidence.experiment.variants)
-    runs = [evidence.runs(v, name) for _, name in evidence.table_rows() for v in variants]
+    runs = [evidence.rows_of(v, name) for _, name in evidence.table_rows() for v in variants]
     return caption_of(evidence, pd.concat(runs) if runs else pd.DataFrame(), variants)
 
 
@@ -102,7 +102,7 @@ def verdict_of(evidence: Evidence, dataset_id: str) -> str:
     variant, dce = experiment.variant("DCE"), scores["DCE"]
     rivals = {name: score for name in RIVALS if (score := scores[name]) is not None}
     if n_lost := evidence.n_diverged(variant, dataset_id):
-        return f"DCE diverged on {n_lost} of {evidence.runs(variant, dataset_id)['seed'].nunique()} seeds"
+        return f"DCE diverged on {n_lost} of {evidence.rows_of(variant, dataset_id)['seed'].nunique()} seeds"
     if dce is None or not rivals:
         return "not tested"
     best = max(rivals, key=rivals.__getitem__)

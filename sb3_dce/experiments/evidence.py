@@ -50,6 +50,7 @@ class Evidence:
     :param n_updates: only runs of this length; ``None`` takes for each dataset the length most of its variants have, the
         longest of these
     :param hash_here: gives the SHA-256 of a dataset's file on this machine, ``None`` without one
+    :param whole: evidence that this one is a part of, see :meth:`among`
     """
 
     def __init__(
@@ -59,20 +60,20 @@ class Evidence:
         scale: Scale,
         n_updates: int | None = None,
         hash_here: Callable[[str], str | None] = lambda _: None,
+        whole: Evidence | None = None,
     ) -> None:
         self.experiment, self.scale = experiment, scale
         if experiment.report != TIMING and (rows["experiment"] == TIMING).any():
             rows = rows[rows["experiment"] != TIMING]
         self._rows, self._n_updates, self._hash_here = rows, n_updates, hash_here
-        self._whole = self
+        self._whole = whole or self
         self._sha_of: dict[str, str] = {}
         self._on_file: dict[str, pd.DataFrame] = {}
         self._length_of: dict[str, int | None] = {}
         self._of_variant: dict[tuple[str, str], pd.DataFrame] = {}
         self._runs: dict[tuple[str, str], pd.DataFrame] = {}
         self._views: dict[tuple[tuple[str, ...], int | None], Evidence] = {}
-        self._again: dict[tuple[str, str], list[pd.DataFrame]] = {}
-        self.left_out = 0
+        self._same_agent: dict[tuple[str, str], list[pd.DataFrame]] = {}
 
     # -- a part of it ----------------------------------------------------------------------------------------------
 
@@ -88,10 +89,8 @@ class Evidence:
         length = self._n_updates if self._n_updates is not None else n_updates
         key = tuple(v.name for v in variants), length
         if key not in self._views:
-            view = Evidence(replace(self.experiment, variants=variants), self._rows, self.scale, length, self._hash_here)
-            view._whole, view._again = self._whole, self._again
-            view.__dict__["_groups"] = self._groups  # to group all rows takes longer than all else
-            self._views[key] = view
+            part = replace(self.experiment, variants=variants)
+            self._views[key] = Evidence(part, self._rows, self.scale, length, self._hash_here, self._whole)
         return self._views[key]
 
     def of_one_length(self, names: Iterable[str], papers: Iterable[str | None] = (None,)) -> Evidence:
@@ -108,8 +107,19 @@ class Evidence:
 
     # -- which data ------------------------------------------------------------------------------------------------
 
+    @property
+    def left_out(self) -> int:
+        """
+        :return: runs on another version of a file than the one that is taken
+        """
+        names = [EMBEDDED] if self.scale.source == "embedded" else [name for d in self.experiment.datasets for name in d.ids]
+        own = {name: runs_in(self._own_and_shared(name)[0])["dataset_sha256"] for name in names}
+        return sum(int((hashes != self._file(name)).sum()) for name, hashes in own.items() if len(hashes))
+
     @cached_property
     def _groups(self) -> dict[tuple[str, str, str], pd.DataFrame]:
+        if self._whole is not self:
+            return self._whole._groups  # to group all rows takes longer than all else
         return dict(iter(self._rows.groupby(["dataset", "agent", "config_hash"], sort=False, observed=True)))  # type: ignore[arg-type]
 
     def ids(self, dataset: GridDataset) -> list[str]:
@@ -120,7 +130,7 @@ class Evidence:
         names = [EMBEDDED] if self.scale.source == "embedded" and dataset == self.experiment.datasets[0] else list(dataset.ids)
         if self.scale.source == "embedded" and names != [EMBEDDED]:
             return []
-        return [name for name in names if any(len(self.runs(v, name)) for v in self.variants(dataset))]
+        return [name for name in names if any(len(self.rows_of(v, name)) for v in self.variants(dataset))]
 
     def paper_id(self, dataset: GridDataset) -> str:
         """
@@ -151,7 +161,7 @@ class Evidence:
         """
         dataset = self.entry(paper)
         ids = self.ids(dataset)
-        return max(ids, key=lambda name: sum(bool(len(self.runs(v, name))) for v in self.variants(dataset)), default=None)
+        return max(ids, key=lambda name: sum(bool(len(self.rows_of(v, name))) for v in self.variants(dataset)), default=None)
 
     def entry(self, paper: str | None) -> GridDataset:
         """
@@ -174,8 +184,8 @@ class Evidence:
         :param variants: agents
         :return: data, length and seeds that a statement about them rests on, and which runs are lost
         """
-        shown = [v for v in variants if len(self.runs(v, dataset_id))]
-        seeds = sorted({self.runs(v, dataset_id)["seed"].nunique() for v in shown}) or [0]
+        shown = [v for v in variants if len(self.rows_of(v, dataset_id))]
+        seeds = sorted({self.rows_of(v, dataset_id)["seed"].nunique() for v in shown}) or [0]
         lost = [f"{v.name}: {n} diverged" for v in shown if (n := self.n_diverged(v, dataset_id))]
         word = "seed" if seeds[-1] == 1 else "seeds"
         return "; ".join([f"{dataset_id}, {self.n_updates(dataset_id) or 0:,} steps, {span(seeds)} {word}", *lost])
@@ -191,7 +201,7 @@ class Evidence:
         """Runs of the variants on any version of a file; and with them those of other variants that are the same agents."""
         keys = {(dataset_id, v.algo, variant_hash(v, dataset_id, self.scale)): v for v in self._variants_on(dataset_id)}
         parts = [self._groups[key] for key in sorted(keys) if key in self._groups]
-        again = [part for variant in keys.values() for part in self._of_the_same_agent(variant, dataset_id)]
+        again = [part for variant in keys.values() for part in self._rows_of_the_same_agent(variant, dataset_id)]
         nothing = self._rows.iloc[:0]
         return pd.concat(parts) if parts else nothing, pd.concat([*parts, *again]) if parts or again else nothing
 
@@ -199,11 +209,9 @@ class Evidence:
         """SHA-256 of the version of a file that is taken, the same for all parts of the experiment."""
         known = self._whole._sha_of
         if dataset_id not in known:
-            own, found = self._whole._own_and_shared(dataset_id)
-            hashes = runs_in(found)["dataset_sha256"]
+            hashes = runs_in(self._whole._own_and_shared(dataset_id)[1])["dataset_sha256"]
             here = self._hash_here(dataset_id) if hashes.nunique() > 1 else None
-            known[dataset_id] = here if here in set(hashes) else _commonest(hashes)  # type: ignore[assignment]
-            self._whole.left_out += int((runs_in(own)["dataset_sha256"] != known[dataset_id]).sum())
+            known[dataset_id] = here if here is not None and here in set(hashes) else _commonest(hashes)
         return known[dataset_id]
 
     def _of_any_length(self, dataset_id: str) -> pd.DataFrame:
@@ -225,13 +233,13 @@ class Evidence:
             self._length_of[dataset_id] = _usual_length(runs) if len(runs) else None
         return self._length_of[dataset_id]
 
-    def _of_the_same_agent(self, variant: Variant, dataset_id: str) -> list[pd.DataFrame]:
+    def _rows_of_the_same_agent(self, variant: Variant, dataset_id: str) -> list[pd.DataFrame]:
         """
         Where a variant has no runs of a length: those of another configuration that is the same agent over this length, under
         its hash. Of several the one with the most seeds: runs of two precisions are not put together.
         """
-        if (variant.name, dataset_id) in self._again:
-            return self._again[variant.name, dataset_id]
+        if (variant.name, dataset_id) in self._whole._same_agent:
+            return self._whole._same_agent[variant.name, dataset_id]
         wanted, settings = variant_hash(variant, dataset_id, self.scale), settings_in_force(variant, dataset_id, self.scale)
         own = self._groups.get((dataset_id, variant.algo, wanted), self._rows.iloc[:0])
         known = set(own[["dataset_sha256", "n_updates"]].itertuples(index=False, name=None))
@@ -249,8 +257,8 @@ class Evidence:
                 part = rows[(rows["dataset_sha256"] == sha) & (rows["n_updates"] == n_updates)].assign(config_hash=wanted)
                 if key not in found or part["seed"].nunique() > found[key]["seed"].nunique():
                     found[key] = part
-        self._again[variant.name, dataset_id] = list(found.values())
-        return self._again[variant.name, dataset_id]
+        self._whole._same_agent[variant.name, dataset_id] = list(found.values())
+        return self._whole._same_agent[variant.name, dataset_id]
 
     def key_of(self, variant: Variant, dataset_id: str) -> str:
         """
@@ -261,7 +269,7 @@ class Evidence:
         settings = settings_in_force(variant, dataset_id, self.scale)
         return agent_key(variant.algo, settings, self.n_updates(dataset_id) or 1)
 
-    def runs_of_any_length(self, variant: Variant, dataset_id: str) -> pd.DataFrame:
+    def rows_of_any_length(self, variant: Variant, dataset_id: str) -> pd.DataFrame:
         """
         :param variant: of the experiment
         :param dataset_id: data
@@ -276,15 +284,15 @@ class Evidence:
             self._of_variant[key] = rows if self._n_updates is None else rows[rows["n_updates"] == self._n_updates]
         return self._of_variant[key]
 
-    def runs(self, variant: Variant, dataset_id: str) -> pd.DataFrame:
+    def rows_of(self, variant: Variant, dataset_id: str) -> pd.DataFrame:
         """
         :param variant: of the experiment
         :param dataset_id: data
-        :return: as :meth:`runs_of_any_length`, those of the length that most variants have there
+        :return: as :meth:`rows_of_any_length`, those of the length that most variants have there
         """
         key = (variant.name, dataset_id)
         if key not in self._runs:
-            rows = self.runs_of_any_length(variant, dataset_id)
+            rows = self.rows_of_any_length(variant, dataset_id)
             self._runs[key] = rows[rows["n_updates"] == self.n_updates(dataset_id)]
         return self._runs[key]
 
@@ -294,8 +302,8 @@ class Evidence:
         :param dataset_id: data
         :return: rows of its longest runs, if it has none of the length of the others and the caller named no length
         """
-        rows = self.runs_of_any_length(variant, dataset_id)
-        return rows.iloc[:0] if len(self.runs(variant, dataset_id)) else rows[rows["n_updates"] == rows["n_updates"].max()]
+        rows = self.rows_of_any_length(variant, dataset_id)
+        return rows.iloc[:0] if len(self.rows_of(variant, dataset_id)) else rows[rows["n_updates"] == rows["n_updates"].max()]
 
     def last_of_longer(self, variant: Variant, dataset_id: str) -> tuple[np.ndarray, int] | None:
         """
@@ -303,7 +311,7 @@ class Evidence:
         :param dataset_id: data
         :return: scores at the end of its longest runs, and their gradient steps, if these are more than the others have
         """
-        rows = self.runs_of_any_length(variant, dataset_id)
+        rows = self.rows_of_any_length(variant, dataset_id)
         rows = rows[rows["n_updates"] > (self.n_updates(dataset_id) or 0)]
         return _scores_and_length(rows[rows["n_updates"] == rows["n_updates"].max()])
 
@@ -314,7 +322,7 @@ class Evidence:
         :return: scores at the end of its runs of the length with the most seeds, the longest of several, and their gradient
             steps; ``None`` without scores
         """
-        ends = self.runs_of_any_length(variant, dataset_id)
+        ends = self.rows_of_any_length(variant, dataset_id)
         ends = ends[(ends["metric"] == "score") & (ends["step"] == ends["n_updates"])]
         counts = ends["n_updates"].value_counts()
         usual = max(counts.index, key=lambda n: (counts[n], n), default=None)
@@ -339,7 +347,7 @@ class Evidence:
         :param metric: name
         :return: its value at the end of each complete run, in the order of the seeds
         """
-        return at_end(self.runs(variant, dataset_id), metric)
+        return at_end(self.rows_of(variant, dataset_id), metric)
 
     def last_of_other_length(self, variant: Variant, dataset_id: str) -> tuple[np.ndarray, int] | None:
         """
@@ -356,7 +364,7 @@ class Evidence:
         :param metric: name of a fact about the data
         :return: its value
         """
-        rows = self.runs(variant, dataset_id)
+        rows = self.rows_of(variant, dataset_id)
         values = rows[(rows["metric"] == metric) & (rows["step"] == 0)]["value"]
         return float(values.iloc[0]) if len(values) else None
 
@@ -366,7 +374,7 @@ class Evidence:
         :param dataset_id: data
         :return: runs that diverged
         """
-        rows = self.runs(variant, dataset_id)
+        rows = self.rows_of(variant, dataset_id)
         return int((rows["metric"] == "diverged").sum())
 
     def has_ended(self, variant: Variant, dataset_id: str) -> bool:
@@ -384,7 +392,7 @@ class Evidence:
         :param metric: name
         :return: one column per seed, indexed by gradient steps
         """
-        return curve_of(self.runs(variant, dataset_id), metric)
+        return curve_of(self.rows_of(variant, dataset_id), metric)
 
     def tail(self, variant: Variant, dataset_id: str, metric: str) -> float | None:
         """
@@ -451,7 +459,7 @@ class Evidence:
         :return: rows of the runs that stand for them
         """
         cells = [(v, name) for name in dataset_ids for v in variants]
-        parts = [part for cell in cells for part in (self.runs(*cell), self.of_other_length(*cell))]
+        parts = [part for cell in cells for part in (self.rows_of(*cell), self.of_other_length(*cell))]
         return pd.concat(parts) if parts else self._rows.iloc[:0]
 
     def every_run(self, dataset_id: str, variants: Iterable[Variant]) -> pd.DataFrame:

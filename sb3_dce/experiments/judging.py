@@ -282,5 +282,5 @@ def all_diverged(evidence: Evidence, variant: Variant, dataset_id: str | None) -
     """
     if dataset_id is None:
         return False
-    n_runs = evidence.runs(variant, dataset_id)["seed"].nunique()
+    n_runs = evidence.rows_of(variant, dataset_id)["seed"].nunique()
     return 0 < n_runs == evidence.n_diverged(variant, dataset_id)

@@ -84,7 +84,7 @@ def coverage(evidences: Mapping[str, Evidence]) -> list[str]:
                 run_on = {
                     dataset.paper
                     for dataset, name in evidence.table_rows()
-                    if len(evidence.runs(variant, name)) or len(evidence.of_other_length(variant, name))
+                    if len(evidence.rows_of(variant, name)) or len(evidence.of_other_length(variant, name))
                 }
                 covered |= run_on
                 agents.setdefault(len(run_on), []).append(variant.name)

@@ -88,7 +88,7 @@ def run_times(evidence: Evidence, variant: Variant, dataset_ids: list[str]) -> l
     # smoke scale has small networks
     fewer, runs = has_fewer_draws(evidence, variant) or evidence.scale.source == "embedded", []
     for name in dataset_ids:
-        rows = pd.concat([evidence.runs(variant, name), evidence.of_other_length(variant, name)])
+        rows = pd.concat([evidence.rows_of(variant, name), evidence.of_other_length(variant, name)])
         alone = rows[(rows["metric"] == "seconds") & ~rows["device"].str.contains("population")]
         for value, n_updates, device in zip(alone["value"], alone["n_updates"], alone["device"], strict=True):
             runs.append(RunTime(1000.0 * value / n_updates, device, fewer or device.rpartition(" ")[2] in HASTENED))

@@ -271,7 +271,7 @@ def long_table(evidence: Evidence) -> TextTable:
     rows = []
     cells = [(d, name, v) for d, name in evidence.table_rows() for v in evidence.variants(d)]
     for dataset, name, variant in cells:
-        for length, runs in evidence.runs_of_any_length(variant, name).groupby("n_updates"):
+        for length, runs in evidence.rows_of_any_length(variant, name).groupby("n_updates"):
             scores, lost = at_end(runs, "score"), int((runs["metric"] == "diverged").sum())
             if not len(scores) and not lost:
                 continue

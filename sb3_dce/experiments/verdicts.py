@@ -474,7 +474,7 @@ def _leading(evidence: Evidence) -> list[Verdict]:
         one_length = len({evidence.n_updates(name) for name in ids}) == 1
         everything = bool(wanted) and len(ids) == len(wanted) and not missing and one_length
         holds: bool | str | None
-        n_tests = max(1, sum(len(evidence.runs(v, name)) > 0 for v in agents if v is not dce for name in ids))
+        n_tests = max(1, sum(len(evidence.rows_of(v, name)) > 0 for v in agents if v is not dce for name in ids))
         if claim.startswith("C6"):
             seeds = all(len(s) >= PAPER_SEEDS for of in scores.values() for s in of.values())
             ahead = any(_is_clearly_ahead(evidence, name, agents, n_tests) for name in ids)
@@ -557,12 +557,12 @@ def _adroit(evidence: Evidence) -> list[Verdict]:
     pairs: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     ups: list[bool | str] = []
     for dataset, name in view.table_rows():
-        n_runs = [view.runs(v, name)["seed"].nunique() for v in (with_, without)]
+        n_runs = [view.rows_of(v, name)["seed"].nunique() for v in (with_, without)]
         if dataset.paper in (without.datasets or ()) and not dataset.is_other_kind(name) and all(n_runs):
             pairs[name] = (view.last(with_, name), view.last(without, name))
     for name, scores in pairs.items():
         lost = [view.n_diverged(v, name) > 0 for v in (with_, without)]
-        n_runs = [view.runs(v, name)["seed"].nunique() for v in (with_, without)]
+        n_runs = [view.rows_of(v, name)["seed"].nunique() for v in (with_, without)]
         if min(n_runs) >= FEWEST_SEEDS and any(lost):  # what diverges on a seed has failed
             ups += [lost[1]] if lost[0] != lost[1] else []
         elif min(map(len, scores)) >= FEWEST_SEEDS:
