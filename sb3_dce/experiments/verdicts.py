@@ -17,7 +17,7 @@ from sb3_dce.dce_probe import PROBE_BETAS
 from sb3_dce.execution import UPDATES_WORTH_COMPILING
 from sb3_dce.experiments.curves import probe_difference, view_of
 from sb3_dce.experiments.evidence import GAMMA, TAIL, TAU, Evidence
-from sb3_dce.experiments.grid import Variant, source_of
+from sb3_dce.experiments.grid import source_of
 from sb3_dce.experiments.judging import (
     CLOSE,
     SEED_STD_FREEDOM,
@@ -41,6 +41,7 @@ from sb3_dce.experiments.judging import (
     uncertainty,
     values_of,
 )
+from sb3_dce.experiments.leading import leading
 from sb3_dce.experiments.paper import PAPER_SEEDS
 from sb3_dce.experiments.run_times import fastest_runs
 from sb3_dce.experiments.statistics import sample_std
@@ -443,105 +444,6 @@ def _run_times(evidence: Evidence) -> list[Verdict]:
     ]
 
 
-def _leading(evidence: Evidence) -> list[Verdict]:
-    """The paper's statements on where DCE is first, on our rows."""
-    kinds: dict[str, tuple[str, tuple[str, ...]]] = {
-        "C4: DCE is best on every HalfCheetah set": ("halfcheetah", ("random", "medium", "medium-replay", "medium-expert")),
-        "C5: DCE is better on random, medium and medium-replay sets": ("", ("random", "medium", "medium-replay")),
-        "C6: DCE has no significant advantage on medium-expert sets": ("", ("medium-expert",)),
-    }
-    agents = [v for v in evidence.experiment.variants if v.paper is not None]
-    dce = evidence.experiment.variant("DCE")
-    found = []
-    for claim, (task, endings) in kinds.items():
-        wanted = [d for d in evidence.experiment.datasets if _is_of_kind(d.paper, task, endings)]
-        by_source: dict[str, list[str]] = {"D4RL": [], "sb3": []}
-        for dataset, name in evidence.table_rows():
-            if dataset in wanted and (len(evidence.last(dce, name)) or all_diverged(evidence, dce, name)):
-                by_source[source_of(name)].append(name)
-        # the paper's own data if they are all there; never some of these and some of ours
-        ids = by_source["D4RL"] if len(by_source["D4RL"]) >= len(by_source["sb3"]) else by_source["sb3"]
-        scores = {name: {v.name: evidence.last(v, name) for v in agents} for name in ids}
-        whole = {
-            name: [v.name for v in agents if len(evidence.last(v, name)) and not evidence.n_diverged(v, name)] for name in ids
-        }
-        means = {name: {agent: float(scores[name][agent].mean()) for agent in whole[name]} for name in ids}
-        places = {
-            name: 1 + sum(mean > of.get("DCE", -math.inf) for agent, mean in of.items() if agent != "DCE")
-            for name, of in means.items()
-        }
-        missing = [v.name for name in ids for v in agents if not evidence.has_ended(v, name)]
-        one_length = len({evidence.n_updates(name) for name in ids}) == 1
-        everything = bool(wanted) and len(ids) == len(wanted) and not missing and one_length
-        holds: bool | str | None
-        n_tests = max(1, sum(len(evidence.rows_of(v, name)) > 0 for v in agents if v is not dce for name in ids))
-        if claim.startswith("C6"):
-            seeds = all(len(s) >= PAPER_SEEDS for of in scores.values() for s in of.values())
-            ahead = any(_is_clearly_ahead(evidence, name, agents, n_tests) for name in ids)
-            holds = (False if ahead else True if seeds else None) if everything else None
-            rule = (
-                f"nowhere DCE is clearly above every other agent; held with {PAPER_SEEDS} seeds or more, since fewer show no "
-                f"advantage, whether there is one or not"
-            )
-        else:
-            # missing agents and data can only add to those that are ahead
-            holds = False if any(_is_clearly_behind(evidence, name, agents, n_tests) for name in ids) else None
-            if holds is None and everything:
-                holds = True if all(_is_clearly_ahead(evidence, name, agents, n_tests) for name in ids) else CLOSE
-            rule = (
-                "held: DCE is clearly above all the paper's agents on every such set, at one length; did not hold: on one of "
-                "the sets an agent is clearly above it, or it diverged"
-            )
-        rule += "; the 5 % of the test are divided among all comparisons of the claim"
-        absent = [f"{name} on {missing.count(name)} of {len(ids)} sets" for name in sorted(set(missing))]
-        numbers = "; ".join(_by_scope(evidence, agents, places))
-        numbers = (f"place of DCE: {numbers}" if numbers else "no runs of DCE as long as those of the others") + (
-            f"; without runs of this length: {', '.join(absent)}" if absent else ""
-        )
-        found.append(judge(claim, rule, holds, numbers))
-    return found
-
-
-def _by_scope(evidence: Evidence, agents: list[Variant], numbers: dict[str, int]) -> list[str]:
-    """Numbers of data sets, those of one length and one number of seeds together."""
-    found: dict[str, list[str]] = {}
-    for name, number in numbers.items():
-        scope = evidence.scope(name, agents).removeprefix(f"{name}, ")
-        found.setdefault(scope, []).append(f"{name}: {number}")
-    return [f"{', '.join(parts)} ({scope})" for scope, parts in found.items()]
-
-
-def _is_clearly_behind(evidence: Evidence, dataset_id: str, agents: list[Variant], n_tests: int) -> bool:
-    """Whether an agent's mean is above that of DCE by more than seeds could do; a DCE that diverged on a seed has failed."""
-    dce = evidence.experiment.variant("DCE")
-    others = [v for v in agents if v is not dce and len(evidence.last(v, dataset_id))]
-    return evidence.n_diverged(dce, dataset_id) > 0 or any(
-        _is_clearly_above(evidence, v, dce, dataset_id, n_tests) for v in others
-    )
-
-
-def _is_clearly_ahead(evidence: Evidence, dataset_id: str, agents: list[Variant], n_tests: int) -> bool:
-    """Whether DCE is above every other agent, all of which have scores, by more than seeds could do."""
-    dce = evidence.experiment.variant("DCE")
-    return all(_is_clearly_above(evidence, dce, v, dataset_id, n_tests) for v in agents if v is not dce)
-
-
-def _is_clearly_above(evidence: Evidence, one: Variant, other: Variant, dataset_id: str, n_tests: int) -> bool:
-    lost = [evidence.n_diverged(v, dataset_id) > 0 for v in (one, other)]
-    if any(lost):  # what diverges on a seed has failed
-        return lost == [False, True]
-    scores = [evidence.last(v, dataset_id) for v in (one, other)]
-    if not all(map(len, scores)):
-        return False
-    means = [float(each.mean()) for each in scores]
-    errors = [uncertainty(evidence, each, dataset_id) for each in scores]
-    return differs(means[0] - means[1], errors[0], errors[1], n_tests) is True
-
-
-def _is_of_kind(paper: str, task: str, endings: tuple[str, ...]) -> bool:
-    return paper.startswith(task) and paper.removesuffix("-v2").partition("-")[2] in endings
-
-
 def _mean_of(scores: np.ndarray) -> str:
     return f"{scores.mean():.1f}" if len(scores) else "diverged"
 
@@ -599,7 +501,7 @@ def _adroit(evidence: Evidence) -> list[Verdict]:
 
 
 _TESTS: dict[str, tuple[Callable[[Evidence], list[Verdict]], ...]] = {
-    "table1": (_leading,),
+    "table1": (leading,),
     "run-times": (_run_times,),
     "table-adroit-kitchen": (_adroit,),
     "fig-tau": (_tau,),

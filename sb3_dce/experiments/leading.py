@@ -1,0 +1,140 @@
+"""The paper's statements on where DCE is first (C4 to C6), judged by its place among all agents on the table's data."""
+
+from __future__ import annotations
+
+import math
+
+from sb3_dce.experiments.evidence import Evidence
+from sb3_dce.experiments.grid import GridDataset, Variant, source_of
+from sb3_dce.experiments.judging import CLOSE, Verdict, all_diverged, differs, judge, uncertainty
+from sb3_dce.experiments.paper import PAPER_SEEDS
+
+DIVIDED = "the 5 % of the test are divided among all comparisons of the claim"
+
+
+def leading(evidence: Evidence) -> list[Verdict]:
+    """
+    :param evidence: of the Gym table
+    :return: verdicts on C4, C5 and C6
+    """
+    cheetah = [f"halfcheetah-{kind}-v2" for kind in ("random", "medium", "medium-replay", "medium-expert")]
+    datasets = evidence.experiment.datasets
+    return [
+        _is_best("C4: DCE is best on every HalfCheetah set", Field(evidence, [d for d in datasets if d.paper in cheetah])),
+        _is_best(
+            "C5: DCE is better on random, medium and medium-replay sets",
+            Field(evidence, [d for d in datasets if not d.paper.endswith("-medium-expert-v2")]),
+        ),
+        _has_no_advantage(
+            "C6: DCE has no significant advantage on medium-expert sets",
+            Field(evidence, [d for d in datasets if d.paper.endswith("-medium-expert-v2")]),
+        ),
+    ]
+
+
+class Field:
+    """
+    DCE and all other agents of the paper on some of the table's data: the paper's own files if they are all there, else ours,
+    never some of both.
+
+    :param evidence: of a table
+    :param wanted: rows of the table that the claim is about
+    """
+
+    def __init__(self, evidence: Evidence, wanted: list[GridDataset]) -> None:
+        self.evidence = evidence
+        self.dce = evidence.experiment.variant("DCE")
+        self.others = [v for v in evidence.experiment.variants if v.paper is not None and v is not self.dce]
+        rows = [name for dataset, name in evidence.table_rows() if dataset in wanted]
+        rows = [name for name in rows if len(evidence.last(self.dce, name)) or all_diverged(evidence, self.dce, name)]
+        by_source = {source: [name for name in rows if source_of(name) == source] for source in ("D4RL", "sb3")}
+        self.ids = max(by_source.values(), key=len)
+        self.missing = [v.name for name in self.ids for v in self.agents if not evidence.has_ended(v, name)]
+        lengths = {evidence.n_updates(name) for name in self.ids}
+        self.is_complete = 0 < len(wanted) == len(self.ids) and not self.missing and len(lengths) == 1
+        self.n_tests = max(1, sum(len(evidence.rows_of(v, name)) > 0 for v in self.others for name in self.ids))
+
+    @property
+    def agents(self) -> list[Variant]:
+        """
+        :return: DCE and the others
+        """
+        return [self.dce, *self.others]
+
+    def place(self, dataset_id: str) -> int:
+        """
+        :param dataset_id: data
+        :return: DCE's place by the mean over seeds; an agent that diverged on a seed has none before it
+        """
+        means = {v.name: self._mean(v, dataset_id) for v in self.agents}
+        return 1 + sum(means[v.name] > means["DCE"] for v in self.others)
+
+    def _mean(self, agent: Variant, dataset_id: str) -> float:
+        scores = self.evidence.last(agent, dataset_id)
+        return float(scores.mean()) if len(scores) and not self.evidence.n_diverged(agent, dataset_id) else -math.inf
+
+    def is_first(self, dataset_id: str) -> bool:
+        """
+        :param dataset_id: data
+        :return: whether DCE is above every other agent, all of which have scores, by more than seeds could do
+        """
+        return all(self._is_above(self.dce, v, dataset_id) for v in self.others)
+
+    def is_beaten(self, dataset_id: str) -> bool:
+        """
+        :param dataset_id: data
+        :return: whether an agent is above DCE by more than seeds could do; a DCE that diverged on a seed has failed
+        """
+        failed = self.evidence.n_diverged(self.dce, dataset_id) > 0
+        return failed or any(self._is_above(v, self.dce, dataset_id) for v in self.others)
+
+    def _is_above(self, one: Variant, other: Variant, dataset_id: str) -> bool:
+        lost = [self.evidence.n_diverged(v, dataset_id) > 0 for v in (one, other)]
+        if any(lost):  # what diverges on a seed has failed
+            return lost == [False, True] and len(self.evidence.last(one, dataset_id)) > 0
+        scores = [self.evidence.last(v, dataset_id) for v in (one, other)]
+        if not all(map(len, scores)):
+            return False
+        errors = [uncertainty(self.evidence, each, dataset_id) for each in scores]
+        return differs(float(scores[0].mean() - scores[1].mean()), errors[0], errors[1], self.n_tests) is True
+
+    def numbers(self) -> str:
+        """
+        :return: DCE's places, those of one length and one number of seeds together, and which agents have no runs
+        """
+        if not self.ids:
+            return "no runs of DCE as long as those of the others"
+        by_scope: dict[str, list[str]] = {}
+        for name in self.ids:
+            scope = self.evidence.scope(name, self.agents).removeprefix(f"{name}, ")
+            by_scope.setdefault(scope, []).append(f"{name}: {self.place(name)}")
+        text = "place of DCE: " + "; ".join(f"{', '.join(places)} ({scope})" for scope, places in by_scope.items())
+        absent = [f"{name} on {self.missing.count(name)} of {len(self.ids)} sets" for name in sorted(set(self.missing))]
+        return text + (f"; without runs of this length: {', '.join(absent)}" if absent else "")
+
+
+def _is_best(claim: str, field: Field) -> Verdict:
+    rule = (
+        "held: DCE is clearly above all the paper's agents on every such set, at one length; did not hold: on one of the sets "
+        f"an agent is clearly above it, or it diverged; {DIVIDED}"
+    )
+    holds: bool | str | None = None
+    if any(map(field.is_beaten, field.ids)):  # missing agents and data can only add to those that are ahead
+        holds = False
+    elif field.is_complete:
+        holds = True if all(map(field.is_first, field.ids)) else CLOSE
+    return judge(claim, rule, holds, field.numbers())
+
+
+def _has_no_advantage(claim: str, field: Field) -> Verdict:
+    rule = (
+        f"nowhere DCE is clearly above every other agent; held with {PAPER_SEEDS} seeds or more, since fewer show no "
+        f"advantage, whether there is one or not; {DIVIDED}"
+    )
+    holds: bool | None = None
+    if field.is_complete and any(map(field.is_first, field.ids)):
+        holds = False
+    elif field.is_complete:
+        seeds = [len(field.evidence.last(v, name)) for v in field.agents for name in field.ids]
+        holds = True if min(seeds) >= PAPER_SEEDS else None
+    return judge(claim, rule, holds, field.numbers())
