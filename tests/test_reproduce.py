@@ -273,14 +273,21 @@ def test_population_killed_while_it_writes_its_results_only_writes_the_rest(
     assert not list((tmp_path / "runs").glob("*.pt")) and not list((tmp_path / "runs").glob("*/checkpoint*"))
 
 
-def test_population_whose_checkpoints_have_gone_is_none_to_go_on_with(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trained: list[int]
-) -> None:
+@pytest.fixture
+def interrupted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trained: list[int]) -> list[PlannedRun]:
+    """Runs of a population that was killed before it wrote its results."""
     plan = [r for r in small_plan("fig-beta", tmp_path, updates=4) if r.spec.algo == "dce"]
     with monkeypatch.context() as patch:
         patch.setattr(BatchedRuns, "_finish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             train(plan, device="cuda")
+    return plan
+
+
+def test_population_whose_checkpoints_have_gone_is_none_to_go_on_with(
+    tmp_path: Path, interrupted: list[PlannedRun], trained: list[int]
+) -> None:
+    plan = interrupted
     train(plan[:4], device="cuda")  # a smaller plan begins these anew, and deletes their checkpoints
     (tmp_path / "runs" / "population-damaged.pt").write_bytes(b"no state")
     train(plan, device="cuda")
@@ -302,14 +309,8 @@ def test_large_agents_are_trained_in_smaller_populations() -> None:
 
 
 @pytest.mark.parametrize("harm", ["state", "checkpoint"])
-def test_population_that_cannot_go_on_begins_anew(
-    harm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trained: list[int]
-) -> None:
-    plan = [r for r in small_plan("fig-beta", tmp_path, updates=4) if r.spec.algo == "dce"]
-    with monkeypatch.context() as patch:
-        patch.setattr(BatchedRuns, "_finish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-        with pytest.raises(KeyboardInterrupt):
-            train(plan, device="cuda")
+def test_population_that_cannot_go_on_begins_anew(harm: str, tmp_path: Path, interrupted: list[PlannedRun]) -> None:
+    plan = interrupted
     (state,) = (tmp_path / "runs").glob("*.pt")
     if harm == "state":
         state.write_bytes(b"no state")
