@@ -49,9 +49,9 @@ def variant_table(evidence: Evidence) -> TextTable:
         rows.append((name, *cells, verdict_of(evidence, name)))
     header = ("data", *(v.name for v in variants), "finding")
     note = (
-        "Each column after DCE changes one thing of the paper's row; 'scaled rewards' is one setting for all data, beta 4 with "
-        f"returns that spread over 1000. A change is named as a cause if it closes at least "
-        f"{SHARE:.0%} of the distance between DCE and the better of BC and IQL, and is clearly better ({CLEARLY}). One that "
+        "Each column after DCE changes one thing of the paper's row; 'scaled rewards' is one setting for all data, beta 4 "
+        f"with returns that spread over 1000. A change is named as a cause if it closes at least {SHARE:.0%} of the distance "
+        f"between DCE and the better of BC and IQL, and is clearly better ({CLEARLY}). One that "
         "is none over the length of the runs (a constant beta, before the first change of the row's schedule) differs by "
         "rounding alone and is not counted. Rising and falling are the same share between the middle and the end of the run; "
         "the survival condition is that the mean reward exceeds beta_eff."
