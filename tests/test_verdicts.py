@@ -320,6 +320,18 @@ def test_runs_of_the_papers_length_are_compared_with_it_though_others_are_shorte
     assert reproduction(Evidence(table, results.merge([long, short]), full)).numbers.startswith("1 of 1 rows")
 
 
+@pytest.mark.parametrize(
+    ("largest", "others", "outcome"),
+    [(8.0, 4.0, HELD), (4.4, 4.0, CLOSE), (2.5, 4.0, NOT_HELD), (0.01, 0.0, NOT_HELD)],
+)
+def test_large_wave_can_be_seen_and_is_the_largest(largest: float, others: float, outcome: str) -> None:
+    experiment = load_experiment("fig-beta")
+    sizes = {"beta 0": others, "beta 2": largest, "beta 4": others, "beta 8": others}
+    waves = {name: [100.0 + size * (-1) ** i for i in range(40)] for name, size in sizes.items()}
+    rows = [run_rows(experiment, n, CHEETAH, 0, curves={"q_data": q}, n_updates=200_000) for n, q in waves.items()]
+    assert one_of(outcomes("fig-beta", results.merge(rows)), "large wave") == outcome
+
+
 def test_wave_of_a_run_that_diverged_is_not_judged() -> None:
     experiment = load_experiment("fig-beta")
     curve = [float(i % 3) for i in range(20)]

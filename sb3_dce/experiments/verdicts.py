@@ -91,6 +91,20 @@ def _waviness(curve: np.ndarray) -> float:
     return float(np.std(curve - np.polyval(np.polyfit(steps, curve, 1), steps), ddof=1))
 
 
+# What can be seen in a figure whose axis begins at 0.
+LARGE_WAVE = 0.02
+# Two spreads of one curve each are called different beyond this factor.
+FLATTER = 1.25
+
+
+def _has_largest_wave(waves: Values, name: str, level: float) -> bool | str:
+    """Whether a curve has a wave that can be seen and is the largest, ``CLOSE`` if another has one about as large."""
+    if waves[name] < LARGE_WAVE * abs(level):
+        return False
+    ratio = waves[name] / max(wave for other, wave in waves.items() if other != name)
+    return CLOSE if 1 / FLATTER < ratio < FLATTER else ratio > 1
+
+
 def _beta(evidence: Evidence) -> list[Verdict]:
     betas = ["beta 0", "beta 2", "beta 4", "beta 8"]
     returns, q_values = values_of(evidence, betas, "score"), values_of(evidence, betas, "q_data")
@@ -122,8 +136,9 @@ def _beta(evidence: Evidence) -> list[Verdict]:
         judge("In-data Q falls as beta rises", f"Q of beta 0 > 2 > 4 > 8 ({TENTH})", falling(q_values), text_of(q_values)),
         judge(
             "In-data Q of beta 2 has a large wave",
-            "the curve's second half deviates from a straight line by the largest standard deviation of all betas",
-            None if len(waves) < len(betas) else max(waves, key=waves.__getitem__) == "beta 2",
+            "the curve's second half deviates from a straight line by a standard deviation of at least "
+            f"{LARGE_WAVE:.0%} of its Q, and the largest of all betas by more than a factor of {FLATTER:g}",
+            None if len(waves) < len(betas) or q_values is None else _has_largest_wave(waves, "beta 2", q_values["beta 2"]),
             _shape_text(waves, 2),
         ),
         judge(
@@ -295,10 +310,6 @@ def _range_by_chance(errors: list[Uncertainty]) -> float:
     freedom = SEED_STD_FREEDOM if any(each.borrowed for each in errors) else sum(each.freedom for each in errors)
     quantile = RANGE_OF_FIVE[max(known for known in RANGE_OF_FIVE if known <= max(freedom, SEED_STD_FREEDOM))]
     return quantile * math.sqrt(float(np.mean([each.error**2 for each in errors])))  # pooled
-
-
-# Two spreads of one curve each are called different beyond this factor.
-FLATTER = 1.25
 
 
 def _cql_q(evidence: Evidence) -> list[Verdict]:
