@@ -136,8 +136,9 @@ def read_config(folder: Path) -> dict[str, Any] | None:
     :return: its ``config.yml``, ``None`` if it has not begun
     :raises CheckpointError: if the file is damaged, or another program's
     """
-    config = _read(folder / "config.yml", yaml.safe_load, ("run", "dataset", "hyperparameters"))
-    if config is not None and not all(isinstance(config[name], dict) for name in ("run", "dataset", "hyperparameters")):
+    parts = ("run", "dataset", "hyperparameters")
+    config = _read(folder / "config.yml", yaml.safe_load, parts)
+    if config is not None and not all(isinstance(config[name], dict) for name in parts):
         raise _not_of_a_run(folder / "config.yml")
     return config
 

@@ -85,7 +85,7 @@ def _further(evidence: Evidence, runs: pd.DataFrame, variants: list[Variant]) ->
     found, here = [], set(runs.itertuples(index=False, name=None))
     for name, sha in runs[["dataset", "dataset_sha256"]].drop_duplicates().itertuples(index=False, name=None):
         of = evidence.every_run(name, variants)
-        more = [run for run in of[of["dataset_sha256"] == sha].itertuples(index=False, name=None) if run not in here]
-        lengths = [run[list(of.columns).index("n_updates")] for run in more]
-        found += [f"{lengths.count(n)} of {n:,} steps on {name}" for n in sorted(set(lengths))]
+        of = of[of["dataset_sha256"] == sha]
+        lengths = of["n_updates"][[run not in here for run in of.itertuples(index=False, name=None)]]
+        found += [f"{k} of {n:,} steps on {name}" for n, k in lengths.value_counts().sort_index().items()]
     return found

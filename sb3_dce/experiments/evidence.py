@@ -31,12 +31,11 @@ from sb3_dce.experiments.grid import (
     settings_in_force,
     variant_hash,
 )
-from sb3_dce.experiments.results import TIMING
+from sb3_dce.experiments.results import RUN_KEY, TIMING
 from sb3_dce.theory import beta_eff, shift_factor, value_shift_factor
 
 UPDATES_PER_EPOCH = 1000
 TAIL = 0.1  # share of a run, from its end, that stands for what it has become
-RUN_COLUMNS = ["dataset", "dataset_sha256", "agent", "config_hash", "n_updates", "seed"]
 GAMMA, TAU = 0.99, 0.005  # of all DCE runs of the figures (paper, common configuration)
 
 
@@ -479,7 +478,7 @@ def runs_in(rows: pd.DataFrame) -> pd.DataFrame:
     :param rows: any
     :return: one line per run
     """
-    return rows[RUN_COLUMNS].drop_duplicates()
+    return rows[RUN_KEY].drop_duplicates()
 
 
 def at_end(rows: pd.DataFrame, metric: str) -> np.ndarray:
