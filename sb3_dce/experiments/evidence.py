@@ -112,7 +112,7 @@ class Evidence:
         :return: runs on another version of a file than the one that is taken
         """
         names = [EMBEDDED] if self.scale.source == "embedded" else [name for d in self.experiment.datasets for name in d.ids]
-        own = {name: runs_in(self._own_and_shared(name)[0])["dataset_sha256"] for name in names}
+        own = {name: self.every_run(name, self.experiment.variants)["dataset_sha256"] for name in names}
         return sum(int((hashes != self._file(name)).sum()) for name, hashes in own.items() if len(hashes))
 
     @cached_property
@@ -196,19 +196,24 @@ class Evidence:
         entries = [d for d in self.experiment.datasets if dataset_id in d.ids] or self.experiment.datasets[:1]
         return [v for v in self.experiment.variants if any(v in self.variants(entry) for entry in entries)]
 
-    def _own_and_shared(self, dataset_id: str) -> tuple[pd.DataFrame, pd.DataFrame]:
-        """Runs of the variants on any version of a file; and with them those of other variants that are the same agents."""
-        keys = {(dataset_id, v.algo, variant_hash(v, dataset_id, self.scale)): v for v in self._variants_on(dataset_id)}
-        parts = [self._groups[key] for key in sorted(keys) if key in self._groups]
-        again = [part for variant in keys.values() for part in self._rows_of_the_same_agent(variant, dataset_id)]
-        nothing = self._rows.iloc[:0]
-        return pd.concat(parts) if parts else nothing, pd.concat([*parts, *again]) if parts or again else nothing
+    def _own(self, dataset_id: str, variants: Iterable[Variant]) -> list[pd.DataFrame]:
+        """Rows of those of the variants that the grid has on these data, of any length and on any version of the file."""
+        wanted, here = list(variants), self._variants_on(dataset_id)
+        keys = {(dataset_id, v.algo, variant_hash(v, dataset_id, self.scale)) for v in here if v in wanted}
+        return [self._groups[key] for key in sorted(keys) if key in self._groups]
+
+    def _on_any_file(self, dataset_id: str) -> pd.DataFrame:
+        """Rows of the variants, and of other variants that are the same agents."""
+        here = {variant_hash(v, dataset_id, self.scale) + v.algo: v for v in self._variants_on(dataset_id)}
+        again = [part for variant in here.values() for part in self._rows_of_the_same_agent(variant, dataset_id)]
+        parts = [*self._own(dataset_id, here.values()), *again]
+        return pd.concat(parts) if parts else self._rows.iloc[:0]
 
     def _file(self, dataset_id: str) -> str:
         """SHA-256 of the version of a file that is taken, the same for all parts of the experiment."""
         known = self._whole._sha_of
         if dataset_id not in known:
-            hashes = runs_in(self._whole._own_and_shared(dataset_id)[1])["dataset_sha256"]
+            hashes = runs_in(self._whole._on_any_file(dataset_id))["dataset_sha256"]
             here = self._hash_here(dataset_id) if hashes.nunique() > 1 else None
             known[dataset_id] = here if here is not None and here in set(hashes) else _commonest(hashes)
         return known[dataset_id]
@@ -216,7 +221,7 @@ class Evidence:
     def _of_any_length(self, dataset_id: str) -> pd.DataFrame:
         """All runs of the variants on one file."""
         if dataset_id not in self._on_file:
-            _, found = self._own_and_shared(dataset_id)
+            found = self._on_any_file(dataset_id)
             self._on_file[dataset_id] = found[found["dataset_sha256"] == self._file(dataset_id)] if len(found) else found
         return self._on_file[dataset_id]
 
@@ -467,9 +472,7 @@ class Evidence:
         :param variants: agents
         :return: one line per run of those that the grid has there, of any length and on any version of the file
         """
-        here = self._variants_on(dataset_id)
-        keys = {(dataset_id, v.algo, variant_hash(v, dataset_id, self.scale)) for v in variants if v in here}
-        parts = [self._groups[key] for key in sorted(keys) if key in self._groups]
+        parts = self._own(dataset_id, variants)
         return runs_in(pd.concat(parts) if parts else self._rows.iloc[:0])
 
 
