@@ -16,6 +16,8 @@ class ActorLearningRate(OfflineAlgorithm):
 
     def check_parameters(self) -> None:
         """
+        The parameters of the base classes come first, then ``actor_learning_rate``: ``None`` or above 0.
+
         :raises ConfigError: if a parameter is out of its range
         """
         super().check_parameters()
@@ -23,6 +25,8 @@ class ActorLearningRate(OfflineAlgorithm):
 
     def learning_rates(self) -> dict[str, float]:
         """
+        The actor's own rate, a constant even beside a schedule, is added; where it is ``None`` that of the other networks.
+
         :return: learning rates of the next update by coefficient, ``actor_learning_rate`` among them
         """
         rates = super().learning_rates()

@@ -67,6 +67,8 @@ class GaussianActor(KeepDtype, BasePolicy):
 
     def get_action_dist_params(self, obs: th.Tensor, masks: Sequence[th.Tensor] | None = None) -> tuple[th.Tensor, th.Tensor]:
         """
+        Mean ``tanh(mu(s))`` of the Gaussian and its log standard deviation, clamped to [-5, 2] as in the authors' code.
+
         :param obs: shape (batch, *obs_shape)
         :param masks: per hidden layer a factor of shape (batch, width): 0, or 1 / (1 - dropout)
         :return: mean in (-1, 1), shape (batch, action_dim), and log standard deviation, shape (action_dim,)
@@ -77,6 +79,8 @@ class GaussianActor(KeepDtype, BasePolicy):
 
     def forward(self, obs: th.Tensor, deterministic: bool = False) -> th.Tensor:
         """
+        Actions of the policy without dropout: one draw per observation from PyTorch's global generator, or the mean.
+
         :param obs: shape (batch, *obs_shape)
         :param deterministic: the mean instead of a draw
         :return: actions clipped to [-1, 1], shape (batch, action_dim)

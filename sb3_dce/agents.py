@@ -35,6 +35,8 @@ PROBES: dict[str, type[OfflineAlgorithm]] = {OfflineDCEProbe.algo_name: OfflineD
 
 def agent_class(algo: str) -> type[OfflineAlgorithm]:
     """
+    Class that an agent's name stands for; a probe is found too, but is not among the names that an error offers.
+
     :param algo: name such as ``dce`` or ``offline_bc``
     :return: class of the agent
     :raises ConfigError: for an unknown name

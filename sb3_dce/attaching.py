@@ -319,6 +319,8 @@ class AttachingMixin(OffPolicyAlgorithm):
 
     def chosen_rows(self, transitions: Transitions) -> np.ndarray | None:
         """
+        Asked when a dataset goes into the replay buffer; an agent that trains on a part of the rows overrides it.
+
         :param transitions: dataset
         :return: numbers of the rows to train on, ``None`` for all
         """
@@ -375,9 +377,11 @@ class AttachingMixin(OffPolicyAlgorithm):
 
     def check_dataset_fits(self, reward_mean: float, n_terminals: int) -> list[str]:
         """
-        :param reward_mean: mean reward per row as the agent sees it
+        What speaks against training on these data with the agent's parameters, warned of once the rows are attached.
+
+        :param reward_mean: mean reward per row as the agent sees it, scaled and shifted
         :param n_terminals: true terminals in the data
-        :return: texts of warnings
+        :return: texts of warnings; the base class has none
         """
         return []
 
@@ -413,8 +417,10 @@ class AttachingMixin(OffPolicyAlgorithm):
 
 def as_dataset(source: DatasetLike) -> str | os.PathLike[str] | Transitions:
     """
+    Reads what has no name of its own; an id or a path is left to be read when the model needs the rows.
+
     :param source: anything that holds logged steps
-    :return: name or path as it is; of everything else the transitions
+    :return: name, path or ``Transitions`` as it is; of everything else the transitions
     :raises ConfigError: if it holds none
     """
     return source if isinstance(source, str | os.PathLike | Transitions) else load_dataset(source)

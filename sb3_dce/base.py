@@ -182,6 +182,8 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
 
     def make_update(self, storages: dict[str, Storage]) -> Update:
         """
+        The gradient step as a function, with networks and trace-time choices bound; made once for each engine.
+
         :param storages: as returned by :meth:`make_storages`
         :return: pure update ``(state, batch, noise, coef, **variant) -> (new state, metrics)``
         """
@@ -189,27 +191,34 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
 
     def noise_specs(self, batch_size: int) -> dict[str, NoiseSpec]:
         """
+        Kind and shape of the random numbers that are drawn anew for every update.
+
         :param batch_size: rows per gradient step
-        :return: random numbers one update needs
+        :return: specifications by the name that the update reads them by, in the order of the draws
         """
         raise NotImplementedError
 
     def learned_numbers(self) -> dict[str, LearnedNumber]:
         """
-        :return: numbers learned beside the networks, by the attribute of their tensor. Each becomes a storage of the update
-            and a part of the saved model
+        Numbers learned beside the networks, such as the temperature, each with an optimizer of its own; here none.
+
+        :return: by the attribute of their tensor. Each becomes a storage of the update and a part of the saved model
         """
         return {}
 
     def update_variant(self, n_updates: int) -> dict[str, Any]:
         """
+        Keywords of the next update, such as ``with_actor``; each combination is compiled or captured by itself.
+
         :param n_updates: completed updates
-        :return: choices of the next update that are fixed when it is traced
+        :return: choices that are fixed when the update is traced; here none
         """
         return {}
 
     def learning_rates(self) -> dict[str, float]:
         """
+        Rates at the present point of the schedule; they go into the coefficients and into the optimizers that are saved.
+
         :return: learning rate of the next update by coefficient: ``learning_rate``, and ``<network>_learning_rate`` for
             a network that has its own
         """
@@ -217,8 +226,10 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
 
     def coefficients(self, n_updates: int) -> dict[str, float]:
         """
+        Numbers that reach the update as 0-dimensional tensors, so that it need not be traced again when they change.
+
         :param n_updates: completed updates
-        :return: numbers of the next update that may change while training
+        :return: numbers of the next update by name
         """
         return {
             **self.learning_rates(),
@@ -230,6 +241,8 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
 
     def coefficients_hold_until(self, n_updates: int) -> int:
         """
+        Spares a population from asking every member before each update; here nothing is promised beyond the next one.
+
         :param n_updates: completed updates
         :return: completed updates before which :meth:`coefficients` gives the same numbers again
         """
@@ -237,8 +250,10 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
 
     def reads_state_after(self, n_updates: int) -> bool:
         """
+        Whether :meth:`read_state` is to be called now, asked after every update.
+
         :param n_updates: completed updates
-        :return: whether :meth:`read_state` is to be called now. Reading waits for the device: let it be rare
+        :return: False here. Reading waits for the device: let it be rare
         """
         return False
 
@@ -251,12 +266,16 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
 
     def policy_settings(self) -> dict[str, Any]:
         """
-        :return: arguments of the policy that follow from the agent's own parameters
+        Arguments of the policy that follow from the agent's own parameters; ``policy_kwargs`` is merged into them.
+
+        :return: arguments by name; here the features extractor that standardises, if ``normalize_obs`` is set
         """
         return {"features_extractor_class": StandardizedExtractor} if self.normalize_obs else {}
 
     def check_parameters(self) -> None:
         """
+        Runs before networks are made, for a new model and for a loaded one; a subclass adds its own parameters.
+
         :raises ConfigError: if a parameter is out of its range
         """
         check_flags(self)
@@ -338,14 +357,18 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
 
     def hyperparameters(self) -> dict[str, Any]:
         """
-        :return: constructor arguments in force, by name; environment and internal ones left out
+        Constructor arguments in force, as ``config.yml`` records them and as members of a population are compared.
+
+        :return: values by name; policy, environment and internal ones left out
         """
         names = [n for n in constructor_parameters(type(self)) if n not in ("policy", "env", "_init_setup_model")]
         return {name: getattr(self, name) for name in names if hasattr(self, name)}
 
     def make_storages(self) -> dict[str, Storage]:
         """
-        :return: storage of each network, and of further learners, by name
+        Move all parameters and moments into flat vectors, of which the modules' own tensors are views from then on.
+
+        :return: storage of each network, and of further learners, by name; what is ``None`` has none
         """
         modules = {name: getattr(self, name) for name in self.networks}
         storages = {name: Storage.of(module) for name, module in modules.items() if module is not None}
@@ -412,9 +435,11 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
 
     def draw_rows(self, generator: th.Generator, batch_size: int) -> th.Tensor:
         """
+        Row numbers of the next batch, drawn uniformly with replacement from the filled part of the replay buffer.
+
         :param generator: what an update draws with; the rows come first
         :param batch_size: rows per step
-        :return: row numbers of the buffer, shape (batch_size,)
+        :return: shape (batch_size,)
         """
         return th.randint(self._own_buffer().size(), (batch_size,), generator=generator, device=self.device)
 
@@ -531,6 +556,8 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
 
     def check_frequency(self, name: str, value: int) -> None:
         """
+        Refuse a frequency that is no multiple of ``gradient_steps``; 0 and negative ones pass.
+
         :param name: parameter of a callback that acts every so many gradient steps
         :param value: gradient steps
         :raises ConfigError: if it would act in the middle of a chunk of updates

@@ -28,6 +28,8 @@ from sb3_dce.steps import descend
 @dataclass(frozen=True)
 class BCOptions(UpdateOptions):
     """
+    What is fixed when an update of behavioural cloning is traced: which of the two losses it descends.
+
     :param likelihood: maximise the likelihood instead of the squared error
     """
 

@@ -83,9 +83,7 @@ class OfflineReplayBuffer(ReplayBuffer):
 
     @property
     def device(self) -> th.device:
-        """
-        :return: device of the rows; assigning moves them
-        """
+        """Where the rows lie and batches are gathered; assigning moves the rows there."""
         return self._device
 
     @device.setter
@@ -171,7 +169,9 @@ class OfflineReplayBuffer(ReplayBuffer):
 
     def sample_hash(self) -> str:
         """
-        :return: SHA-256 of about a thousand rows, evenly spaced: tells other rows without reading all
+        Tells other rows from those trained on without reading all: evenly spaced ones stand for the rest.
+
+        :return: SHA-256, hexadecimal, of 1000 to 1500 rows; of all if there are fewer than 2000
         """
         assert self.rows is not None
         rows = self.rows[: self.size() : max(1, self.size() // 1000)]
@@ -232,6 +232,8 @@ class OfflineReplayBuffer(ReplayBuffer):
 
     def gather(self, indices: th.Tensor, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """
+        Batch of the given rows in the form that an update reads, through the statistics of a ``VecNormalize`` if there is one.
+
         :param indices: row numbers, shape (batch,)
         :param env: normalises observations and rewards
         :return: tensors of shape (batch, ...); ``dones`` is 1 only at true terminals
@@ -248,6 +250,8 @@ class OfflineReplayBuffer(ReplayBuffer):
 
     def split_rows(self, rows: th.Tensor) -> ReplayBufferSamples:
         """
+        Name the columns of rows that were gathered, here or by a population; the fields are views of them.
+
         :param rows: some rows of this layout, shape (..., batch, width)
         :return: their columns, each of shape (..., batch, ...)
         """
@@ -268,44 +272,32 @@ class OfflineReplayBuffer(ReplayBuffer):
 
     @property
     def observations(self) -> np.ndarray:  # type: ignore[override]
-        """
-        :return: shape (rows, 1, *obs_shape)
-        """
+        """Observations as stored, never standardised, shape (rows, 1, *obs_shape); rows that are not filled yet hold 0."""
         return self._view(0, *self.obs_shape)
 
     @property
     def actions(self) -> np.ndarray:  # type: ignore[override]
-        """
-        :return: scaled to [-1, 1], shape (rows, 1, action_dim)
-        """
+        """Actions scaled to [-1, 1], whatever the bounds of the environment are, shape (rows, 1, action_dim)."""
         return self._view(1, self.action_dim)
 
     @property
     def rewards(self) -> np.ndarray:  # type: ignore[override]
-        """
-        :return: shape (rows, 1)
-        """
+        """Rewards of the data, before anything is scaled or shifted by the agent, shape (rows, 1)."""
         return self._view(2)
 
     @property
     def dones(self) -> np.ndarray:  # type: ignore[override]
-        """
-        :return: 1 at true terminals, shape (rows, 1)
-        """
+        """1 at true terminals, 0 also where a time limit ended the episode, shape (rows, 1)."""
         return self._view(3)
 
     @property
     def next_observations(self) -> np.ndarray:  # type: ignore[override]
-        """
-        :return: shape (rows, 1, *obs_shape)
-        """
+        """Next observations as stored, which targets ignore at terminals, shape (rows, 1, *obs_shape)."""
         return self._view(4, *self.obs_shape)
 
     @property
     def timeouts(self) -> np.ndarray:  # type: ignore[override]
-        """
-        :return: 1 where an episode was cut by its time limit, shape (rows, 1)
-        """
+        """1 where a time limit cut the episode, shape (rows, 1); kept beside the row matrix and in no batch."""
         if self._timeouts is None:
             return np.zeros((0, self.n_envs), dtype=np.float32)
         return self._timeouts.astype(np.float32).reshape(-1, self.n_envs)

@@ -40,6 +40,8 @@ class StaticInputs(NamedTuple):
     @classmethod
     def like(cls, batch: Any, noise: dict[str, th.Tensor]) -> StaticInputs:
         """
+        Buffers in memory of their own, which hold the inputs of the first update to begin with.
+
         :param batch: replay data
         :param noise: random numbers
         :return: buffers with their shapes and values
@@ -48,6 +50,8 @@ class StaticInputs(NamedTuple):
 
     def fits(self, batch: Any) -> bool:
         """
+        Whether a batch can be copied here; one of another size needs new buffers and a new capture.
+
         :param batch: replay data
         :return: whether it has the shapes given at first
         """
@@ -56,6 +60,8 @@ class StaticInputs(NamedTuple):
 
     def fill(self, batch: Any, noise: dict[str, th.Tensor]) -> None:
         """
+        Copy the inputs of one update to where the captured step reads them.
+
         :param batch: replay data of the shapes given at first
         :param noise: random numbers of the shapes given at first
         """
@@ -99,17 +105,17 @@ class CapturedStep:
 
     def reads(self, coef: dict[str, th.Tensor], generator: th.Generator | None) -> bool:
         """
+        Whether the graph reads these very objects, compared by identity; for others a new one has to be captured.
+
         :param coef: coefficients
         :param generator: source of randomness
-        :return: whether it is these that the graph reads
+        :return: False if a tensor or the generator has been replaced
         """
         return self._generator is generator and all(coef[name] is tensor for name, tensor in self._coef.items())
 
     @property
     def is_captured(self) -> bool:
-        """
-        :return: False while it is being warmed up
-        """
+        """Whether updates are replays of the graph by now; False until :attr:`WARM_UP` of them have been made."""
         return self._graph is not None
 
     def replay(self) -> None:

@@ -24,6 +24,8 @@ def check_number(
     hint: str = "Leave it out for the default.",
 ) -> None:
     """
+    Refuse what is no finite number inside an interval; booleans, NaN and numbers as text are none.
+
     :param name: name of the parameter
     :param value: what the user gave
     :param low: smallest allowed value
@@ -45,6 +47,8 @@ def check_number(
 
 def check_optional(name: str, value: Any, low: float, *, hint: str = "None switches it off.", **limits: Any) -> None:
     """
+    Let ``None`` pass, which mostly switches something off, and hold any other value to :func:`check_number`.
+
     :param name: name of a parameter that may be ``None``
     :param value: what the user gave
     :param low: smallest allowed number
@@ -58,6 +62,8 @@ def check_optional(name: str, value: Any, low: float, *, hint: str = "None switc
 
 def check_choice(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
     """
+    Refuse a value that equals none of a few, with a message that lists them.
+
     :param name: name of the parameter
     :param value: what the user gave
     :param allowed: allowed values
@@ -70,8 +76,10 @@ def check_choice(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
 
 def check_seed(seed: Any) -> int | None:
     """
-    :param seed: ``None`` or a whole number, one of NumPy's, too
-    :return: the same as PyTorch takes it
+    The seed as Python's ``int``, which PyTorch wants; ``None``, which draws one, stays as it is.
+
+    :param seed: ``None`` or a whole number from 0 to 2**32 - 1, one of NumPy's, too
+    :return: the same number, or ``None``
     :raises ConfigError: if it is something else
     """
     if seed is None:
@@ -82,6 +90,8 @@ def check_seed(seed: Any) -> int | None:
 
 def check_steps(name: str, value: Any) -> int:
     """
+    A number of gradient steps as an ``int``, also from a float such as ``1e6``; 0 is allowed.
+
     :param name: name of an argument that counts gradient steps
     :param value: what the user gave; ``1e6`` is a whole number, too
     :return: the number
@@ -96,6 +106,8 @@ def check_steps(name: str, value: Any) -> int:
 
 def check_widths(name: str, value: Any, hint: str = "For example [256, 256].") -> None:
     """
+    Refuse what is no list or tuple of whole numbers from 1 up; an empty one is allowed, for no hidden layer.
+
     :param name: name of an argument with the widths of hidden layers
     :param value: list of units per layer
     :param hint: what to do
@@ -108,6 +120,8 @@ def check_widths(name: str, value: Any, hint: str = "For example [256, 256].") -
 
 def did_you_mean(name: str, candidates: Iterable[str]) -> str:
     """
+    First part of a hint on a misspelt name, with a blank behind it so that more can follow.
+
     :param name: what the user wrote
     :param candidates: what is allowed
     :return: "Did you mean '...'? " with the closest candidate, or an empty string
@@ -118,6 +132,8 @@ def did_you_mean(name: str, candidates: Iterable[str]) -> str:
 
 def check_ends_with_evaluation(n_updates: int, eval_freq: int, whose: str = "") -> None:
     """
+    Refuse a length that is no multiple of ``eval_freq``: its last updates would not be in the result.
+
     :param n_updates: gradient steps of a run whose last evaluation is its result
     :param eval_freq: gradient steps between two evaluations
     :param whose: addition to the message
@@ -133,6 +149,8 @@ def check_ends_with_evaluation(n_updates: int, eval_freq: int, whose: str = "") 
 
 def changed_settings(there: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     """
+    Why something that was begun cannot be gone on with; settings that only the beginning had do not count.
+
     :param there: settings of what was begun
     :param now: settings that are asked for
     :return: a text for each of ``now`` that was another

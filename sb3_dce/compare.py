@@ -131,8 +131,10 @@ def compare(
 
 def default_folder(dataset: str) -> Path:
     """
+    ``runs/compare-<dataset>`` below the current folder, where a comparison goes without ``--out``.
+
     :param dataset: id or file
-    :return: folder of its comparison
+    :return: folder of its comparison, need not exist
     """
     return Path("runs") / f"compare-{short_name(dataset)}"
 
@@ -188,6 +190,8 @@ def _summarize(dataset: str, folder: Path, specs: Sequence[RunSpec], console: Co
 
 def settings_of(algos: Sequence[str], overrides: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """
+    Divide the overrides among the agents; one that names its agent wins over one for all.
+
     :param algos: full names of agents
     :param overrides: as in :func:`compare`
     :return: constructor arguments that are set for each agent

@@ -50,8 +50,10 @@ def config_hash(algo: str, hyperparameters: dict[str, Any]) -> str:
 @cache
 def row_of(algo: str, dataset_id: str | None) -> dict[str, Any]:
     """
+    The hyperparameter file's row for a dataset, chosen by :func:`~sb3_dce.hyperparams.load_row`, without the zoo's own keys.
+
     :param algo: name of the agent
-    :param dataset_id: id of the catalogue
+    :param dataset_id: id of the catalogue; ``None`` takes the row ``default``
     :return: constructor arguments of the row that applies, not to be changed; the files are read once
     """
     return hyperparams.split_row(hyperparams.load_row(algo, dataset_id)).kwargs
@@ -60,14 +62,18 @@ def row_of(algo: str, dataset_id: str | None) -> dict[str, Any]:
 @cache
 def defaults_of(algo: str) -> dict[str, Any]:
     """
+    What an agent takes where its row is silent; ``policy``, which has no default, is ``inspect.Parameter.empty``.
+
     :param algo: name of the agent
-    :return: default of each argument of its constructor
+    :return: default of each argument of its constructor but the private ones, not to be changed
     """
     return {name: p.default for name, p in inspect.signature(agent_class(algo)).parameters.items() if name[0] != "_"}
 
 
 def settings_in_force(algo: str, dataset_id: str | None, overrides: Mapping[str, Any]) -> dict[str, Any]:
     """
+    Defaults of the constructor, replaced by the dataset's row, replaced in turn by the overrides.
+
     :param algo: name of the agent
     :param dataset_id: id of the catalogue, whose row of the hyperparameter file applies
     :param overrides: constructor arguments that replace those of the row

@@ -137,8 +137,10 @@ def spec_of_file(path: str | PathLike[str]) -> DatasetSpec | None:
 
 def is_id(name: str) -> bool:
     """
+    Stricter than :func:`resolve`: a file that merely has an alias for its name is not scored as that dataset.
+
     :param name: any
-    :return: whether it is the id of a dataset as it stands, and no alias
+    :return: whether it is the id of a dataset as it stands
     """
     return name in _SPECS
 

@@ -35,9 +35,7 @@ class ColumnSummary:
 
     @property
     def largest(self) -> float:
-        """
-        :return: largest absolute value
-        """
+        """Largest absolute value of the array among those that are finite; infinite if a column has no finite one."""
         return float(max(np.abs(self.low).max(), np.abs(self.high).max()))
 
 

@@ -56,6 +56,8 @@ class DatasetCard:
     @classmethod
     def of(cls, transitions: Transitions) -> DatasetCard:
         """
+        Make the card of a dataset; without a whole episode its means and standard deviations are empty.
+
         :param transitions: dataset
         :return: its card
         """
@@ -75,6 +77,8 @@ class DatasetCard:
     @classmethod
     def read(cls, path: str | PathLike[str]) -> DatasetCard:
         """
+        Read a card, after checking that its quantities are numbers and that each has a mean and a standard deviation.
+
         :param path: file of :meth:`write`
         :return: the card
         :raises DatasetNotFoundError: if there is no such file
@@ -98,7 +102,9 @@ class DatasetCard:
 
     def write(self, path: str | PathLike[str]) -> None:
         """
-        :param path: file to write, JSON
+        Write the card as JSON for :meth:`read`; an existing file is replaced only when the new one is complete.
+
+        :param path: file to write
         :raises CheckpointError: if it cannot be written
         """
         write_text(Path(path), json.dumps(asdict(self), indent=1) + "\n")
@@ -107,6 +113,8 @@ class DatasetCard:
 @dataclass(frozen=True)
 class Comparison:
     """
+    What :func:`compare_datasets` says of two datasets; ``n_quantities`` and ``limit`` are 0 where none was compared.
+
     :param verdict: ``identical``, ``statistically equal`` or ``different``
     :param reasons: why they are different, one line a quantity, the farthest first
     :param n_quantities: quantities compared
@@ -119,9 +127,7 @@ class Comparison:
     limit: float = 0.0
 
     def sentence(self) -> str:
-        """
-        :return: the verdict, and what it rests on
-        """
+        """The verdict for people and, if quantities were compared, how many of them are further apart than the limit."""
         if self.n_quantities == 0:
             return self.verdict
         found = f"{len(self.reasons) or 'none'} of {self.n_quantities} quantities"

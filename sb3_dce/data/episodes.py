@@ -41,9 +41,7 @@ class Episodes:
 
     @property
     def open_last(self) -> bool:
-        """
-        :return: whether the file ends in the middle of an episode
-        """
+        """Whether the file ends in the middle of an episode: neither a flag nor a rule makes its last row an end."""
         return not self.ends[-1]
 
     def returns(self, rewards: np.ndarray) -> np.ndarray:

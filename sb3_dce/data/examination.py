@@ -78,9 +78,7 @@ class Penalty(NamedTuple):
 
     @property
     def shift(self) -> float:
-        """
-        :return: ``beta / (2 c)``, reward units per step
-        """
+        """Shift of Q on the data in one Bellman step, ``beta_eff = beta / (2 c)``, reward units per step."""
         return theory.beta_eff(self.beta, self.td_loss_coef)
 
 
@@ -104,14 +102,14 @@ class Examination:
 
     @property
     def verdict(self) -> Verdict:
-        """
-        :return: the worst verdict of all checks
-        """
+        """The worst verdict of all checks, which decides about the exit code of ``sb3-dce datasets check``."""
         return max((check.verdict for check in self.checks), key=VERDICTS.index)
 
     def as_dict(self) -> dict[str, Any]:
         """
-        :return: the examination for programs: numbers, text and lists only
+        The examination as ``sb3-dce datasets check --json`` prints it, without facts about data that cannot be used.
+
+        :return: numbers, text and lists only
         """
         facts: dict[str, Any] = {}
         if self.transitions is not None:
@@ -139,8 +137,10 @@ class Examination:
 
 def file_hash(info: DatasetInfo) -> str | None:
     """
+    SHA-256 of the file a dataset was read from, for reports; no error where there is no such file.
+
     :param info: facts about a dataset
-    :return: SHA-256 of its file, ``None`` for arrays and for datasets that are a folder of files
+    :return: 64 hexadecimal digits, ``None`` for arrays and for datasets that are a folder of files
     """
     return info.sha256 if info.path is not None and info.path.is_file() else None
 

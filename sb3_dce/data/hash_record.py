@@ -75,6 +75,8 @@ def verify_hash(path: Path, expected: str, hint: str) -> None:
 
 def as_sha256(text: str | None) -> str | None:
     """
+    Bring a hash that a user gives into the spelling of computed ones; None, for no hash, stays None.
+
     :param text: what a user gives as hash of a file
     :return: the same in small letters
     :raises ConfigError: if it is not 64 hexadecimal digits
@@ -90,6 +92,8 @@ def as_sha256(text: str | None) -> str | None:
 
 def record_path(path: Path) -> Path:
     """
+    Where the record of a file lies: beside it, under its name with ``.sha256.json`` behind.
+
     :param path: file of a dataset
     :return: file of its record
     """
@@ -98,6 +102,8 @@ def record_path(path: Path) -> Path:
 
 def read_record(path: Path) -> HashRecord | None:
     """
+    Read what a download has recorded about a file, after checking the types of all fields.
+
     :param path: file of a dataset, need not exist
     :return: its record, None if it has none
     :raises DatasetIntegrityError: if the record cannot be read

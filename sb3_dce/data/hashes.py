@@ -59,10 +59,10 @@ def file_sha256(path: str | PathLike[str]) -> str:
 
 def sha256_once(path: str | PathLike[str]) -> str:
     """
-    :func:`file_sha256` for callers that ask for one file again and again: a large one takes a second.
+    SHA-256 of a file for callers that ask for it again and again, since :func:`file_sha256` takes a second for a large one.
 
     :param path: file
-    :return: SHA-256, from memory as long as size, time of change and inode are what they were
+    :return: 64 hexadecimal digits, from memory as long as size, time of change and inode are what they were
     """
     state = os.stat(path)
     return _remembered(os.path.abspath(path), state.st_size, state.st_mtime_ns, state.st_ino)

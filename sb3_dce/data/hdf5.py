@@ -55,6 +55,8 @@ class HDF5Array:
 
     def __getitem__(self, rows: slice) -> np.ndarray:
         """
+        Read a block of rows; what h5py raises on a damaged file becomes an error of this package.
+
         :param rows: rows to read
         :return: shape (len(rows), ...), in the type of the file
         """
@@ -80,6 +82,8 @@ class EpisodeArray:
 
     def __getitem__(self, rows: slice) -> np.ndarray:
         """
+        Open the array by its path, read a block of rows, and let the array go again.
+
         :param rows: rows to read
         :return: shape (len(rows), ...), in the type of the file
         """

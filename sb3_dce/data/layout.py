@@ -39,18 +39,16 @@ class ArraySource(Protocol):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """
-        :return: shape (rows, ...)
-        """
+        """Shape (rows, ...), known before an entry is read."""
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """
-        :return: type of the entries
-        """
+        """Type of the entries as they are stored; the row matrix is float32 whatever it is."""
 
     def __getitem__(self, rows: slice, /) -> np.ndarray:
         """
+        Read a block of rows, the only way to the entries, so that an array need not fit into memory as a whole.
+
         :param rows: rows to read
         :return: shape (len(rows), ...)
         """
@@ -58,6 +56,8 @@ class ArraySource(Protocol):
 
 def as_array(value: Any, key: str, where: str = "") -> np.ndarray:
     """
+    Array of what a user gives (a list, a tensor, a column), with an error that says what is wanted instead of NumPy's.
+
     :param value: what a user gives for an array
     :param key: its name
     :param where: what it is part of, for the message
@@ -90,49 +90,39 @@ class RowLayout:
 
     @property
     def observations(self) -> slice:
-        """
-        :return: columns of the observation
-        """
+        """Columns of the observation s, the first of each row."""
         return slice(0, self.obs_dim)
 
     @property
     def actions(self) -> slice:
-        """
-        :return: columns of the action
-        """
+        """Columns of the action a, which follow the observation."""
         return slice(self.obs_dim, self.obs_dim + self.act_dim)
 
     @property
     def rewards(self) -> slice:
-        """
-        :return: column of the reward
-        """
+        """Column of the reward r, as a slice of width 1."""
         return slice(self.obs_dim + self.act_dim, self.obs_dim + self.act_dim + 1)
 
     @property
     def terminals(self) -> slice:
-        """
-        :return: column that is 1 at true terminals
-        """
+        """Column of d, 1 at true terminals and else 0, as a slice of width 1."""
         return slice(self.obs_dim + self.act_dim + 1, self.obs_dim + self.act_dim + 2)
 
     @property
     def next_observations(self) -> slice:
-        """
-        :return: columns of the next observation
-        """
+        """Columns of the next observation s', the last of each row."""
         return slice(self.obs_dim + self.act_dim + 2, self.width)
 
     @property
     def width(self) -> int:
-        """
-        :return: number of columns
-        """
+        """Number of columns of a row, ``2 * obs_dim + act_dim + 2``."""
         return 2 * self.obs_dim + self.act_dim + 2
 
 
 def wanted_keys(keys: Iterable[str]) -> tuple[str, ...]:
     """
+    Keys of the arrays that are asked of an HDF5 or NPZ file, whether it has them or not.
+
     :param keys: of a file
     :return: those that are read if they are there; ids of episodes only where flags are missing that would say the same
     """

@@ -23,9 +23,7 @@ class FrameLike(Protocol):
 
     @property
     def columns(self) -> Any:
-        """
-        :return: names
-        """
+        """Names of the columns, by which the arrays of a dataset are found."""
 
 
 class BufferLike(Protocol):
@@ -39,9 +37,7 @@ class EpisodeSource(Protocol):
     """What a loaded dataset of Minari has."""
 
     def iterate_episodes(self) -> Iterable[Any]:
-        """
-        :return: episodes
-        """
+        """Episodes one after the other, each with its observations, actions, rewards and flags."""
 
 
 # Whatever holds logged steps; :func:`load_dataset` says what each must contain.

@@ -67,6 +67,8 @@ def known_dataset(name_or_path: str | PathLike[str]) -> DatasetSpec | None:
 
 def catalogue_id(dataset: str | None) -> str | None:
     """
+    Id under which the hyperparameters and the reference scores of a dataset are looked up, whether its file is here or not.
+
     :param dataset: id or file name
     :return: id of the catalogue, ``None`` if it is not in there
     """
@@ -203,8 +205,10 @@ def _available_hint() -> str:
 
 def short_name(dataset: str | PathLike[str]) -> str:
     """
+    Name of a dataset for folders and headings, without the folder it lies in.
+
     :param dataset: id, ``minari:`` name or file
-    :return: name for folders and headings: the id, or the file's without suffix
+    :return: the id, of Minari with ``-`` in place of ``/``, or the file's name without suffix
     :raises DatasetNotFoundError: if there is no file for it
     """
     if is_minari_name(dataset):

@@ -26,7 +26,9 @@ def require_memory(needed: int, what: str, where: str, hint: str) -> None:
 
 def free_memory() -> int | None:
     """
-    :return: bytes that can be had without swapping, None where the system does not say
+    Memory of this machine that can be had without swapping, by the estimate of Linux (``MemAvailable``).
+
+    :return: bytes, None where the system does not say
     """
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()

@@ -56,6 +56,8 @@ class MinariDataset:
     @property
     def data_format(self) -> str:
         """
+        Format of the episodes on disk by ``metadata.json``, HDF5 if it names none.
+
         :return: ``hdf5``, ``arrow``, ``parquet``, or a format that is not known here
         """
         return str(self.metadata.get("data_format", "hdf5"))
@@ -63,21 +65,27 @@ class MinariDataset:
     @property
     def file(self) -> Path:
         """
-        :return: the file that stands for the dataset; of the formats with a file per episode it is ``metadata.json``
+        The file that stands for the dataset where one path is wanted, such as in messages and for hashes.
+
+        :return: ``main_data.hdf5``; of the formats with a file per episode it is ``metadata.json``
         """
         return self.folder / (METADATA_FILE if self.data_format in ARROW_FORMATS else HDF5_FILE)
 
 
 def is_minari_name(name: Any) -> TypeGuard[str]:
     """
+    Whether a dataset is named by an id of Minari; only the prefix is looked at, not the form of the id.
+
     :param name: whatever names a dataset
-    :return: whether it is an id of Minari with ``minari:`` before it, such as ``minari:D4RL/door/human-v2``
+    :return: True for a text with ``minari:`` before it, such as ``minari:D4RL/door/human-v2``
     """
     return isinstance(name, str) and name.startswith(PREFIX)
 
 
 def minari_id(name: str) -> str:
     """
+    Id without prefix, after checking its form: names, with ``/`` between them, that end in ``-v`` and a number.
+
     :param name: id, with or without ``minari:``
     :return: id, such as ``D4RL/door/human-v2``
     :raises DatasetError: if it is no id
@@ -92,6 +100,8 @@ def minari_id(name: str) -> str:
 
 def dataset_folder(name: str) -> Path:
     """
+    Where Minari keeps a dataset: ``<id>/data`` below ``$MINARI_DATASETS_PATH``, by default ``~/.minari/datasets``.
+
     :param name: id, with or without ``minari:``
     :return: folder in which its data are looked for, need not exist
     """
@@ -222,8 +232,10 @@ def environment_spec(dataset: MinariDataset) -> dict[str, Any]:
 
 def reward_findings(name: str) -> list[Finding]:
     """
+    What has to be said of the Adroit replays door, hammer and relocate, whose rewards may have the wrong sign.
+
     :param name: ``minari:`` and the id
-    :return: a note for data whose rewards deserve a look
+    :return: one note; empty for all other data
     """
     if not _DOUBTFUL_REWARDS.match(name.removeprefix(PREFIX)):
         return []
@@ -236,8 +248,10 @@ def reward_findings(name: str) -> list[Finding]:
 
 def label(leaf: Leaf) -> str:
     """
+    Name of an array within an observation, its keys joined by ``/`` as ``flatten`` takes them.
+
     :param leaf: keys on the way to an array
-    :return: the same as a text
+    :return: for example ``"a/b"``; empty for an observation that is one array
     """
     return "/".join(map(str, leaf))
 

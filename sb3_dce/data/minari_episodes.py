@@ -59,6 +59,8 @@ class Stacked:
 
     def __getitem__(self, rows: slice) -> np.ndarray:
         """
+        Read a block of rows out of all episodes it reaches into, with the arrays of each put side by side.
+
         :param rows: rows to read
         :return: shape (len(rows), width), or (len(rows),) for scalars
         """

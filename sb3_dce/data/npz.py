@@ -62,6 +62,8 @@ def arrays_from_npz(path: str | PathLike[str], *, max_bytes: int = DEFAULT_MAX_B
 
 def text_from_npz(path: str | PathLike[str], key: str) -> str | None:
     """
+    Read a text that stands beside the arrays, such as the bounds of the actions; nothing is unpickled.
+
     :param path: file that :func:`arrays_from_npz` has read
     :param key: name of a member without dimensions, as :func:`write_npz` stores a text
     :return: the text, empty if the member holds something else; ``None`` if it is not there
@@ -74,6 +76,8 @@ def text_from_npz(path: str | PathLike[str], key: str) -> str | None:
 
 def flag_from_npz(path: str | PathLike[str], key: str) -> bool:
     """
+    Whether a file carries a mark such as ``generated``, which keeps it from passing for an official one.
+
     :param path: file that :func:`arrays_from_npz` has read
     :param key: name of a member without dimensions, as :func:`write_npz` stores a truth value
     :return: whether it is there and true

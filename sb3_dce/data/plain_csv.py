@@ -25,6 +25,8 @@ _FLAG_WORDS = {"false": "0", "true": "1"}
 
 def numbers_of(cells: Sequence[str]) -> list[float] | None:
     """
+    Convert cells to numbers as Python does, but without what only Python knows, such as ``1_000`` or digits of other scripts.
+
     :param cells: texts
     :return: their numbers; None if one is none, or is written in a way that only Python takes for a number
     """
@@ -39,6 +41,8 @@ def numbers_of(cells: Sequence[str]) -> list[float] | None:
 
 def without_word(flag: str) -> str:
     """
+    Write a flag as a digit if it is a word, so that False/True and 0/1 are read alike.
+
     :param flag: text of a flag
     :return: 0 or 1 for False or True in any spelling, else the same text
     """

@@ -38,6 +38,8 @@ class Findings:
 
     def note(self, check: CheckName, text: str, count: int | None = None) -> None:
         """
+        Record what training can do with; summaries and ``sb3-dce datasets check`` show it, no warning is issued.
+
         :param check: name of the check
         :param text: what is worth knowing
         :param count: how many entries, rows or episodes it concerns
@@ -46,6 +48,8 @@ class Findings:
 
     def warning(self, check: CheckName, text: str, count: int | None = None) -> None:
         """
+        Record what may spoil training; the reader issues it as a ``DatasetWarning`` once the data are read.
+
         :param check: name of the check
         :param text: what deserves a look
         :param count: how many entries, rows or episodes it concerns

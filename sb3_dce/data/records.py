@@ -83,6 +83,8 @@ class ReadOptions:
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> ReadOptions:
         """
+        Make options of keyword arguments; for an unknown name the error suggests the one that may have been meant.
+
         :param options: what a user gives as keyword arguments of a reader
         :return: options
         :raises ConfigError: for a name that is none of these options, or a value that makes no sense
@@ -122,9 +124,7 @@ class ReadOptions:
 
     @property
     def names_bounds(self) -> bool:
-        """
-        :return: whether the caller or the file says which bounds the actions have
-        """
+        """Whether the caller or the file says which bounds the actions have; else they are taken to be [-1, 1]."""
         return not (self.action_low is self.action_high is self.action_scale is None)
 
     def action_bounds(
@@ -281,16 +281,12 @@ class DatasetInfo:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """
-        :return: things worth knowing
-        """
+        """Texts of the findings that are worth knowing, in the order of the checks."""
         return tuple(finding.text for finding in self.findings if finding.level == "note")
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """
-        :return: things that deserve a look, each also issued as a ``DatasetWarning``
-        """
+        """Texts of the findings that deserve a look, each also issued as a ``DatasetWarning``."""
         return tuple(finding.text for finding in self.findings if finding.level == "warning")
 
     @property
@@ -306,8 +302,10 @@ class DatasetInfo:
 
 def file_state(path: Path) -> tuple[int, int]:
     """
+    What tells, without reading a file, that it was written again since: its size and the time of its last change.
+
     :param path: existing file
-    :return: its size and the time of its last change, nanoseconds
+    :return: bytes, and nanoseconds
     """
     status = os.stat(path)
     return status.st_size, status.st_mtime_ns
@@ -315,6 +313,8 @@ def file_state(path: Path) -> tuple[int, int]:
 
 def bounds_attribute(low: np.ndarray, high: np.ndarray) -> dict[str, str]:
     """
+    Attribute by which a file of this package says the bounds of its actions; :meth:`ReadOptions.with_bounds_of` reads it.
+
     :param low: smallest allowed action, shape (act_dim,)
     :param high: largest allowed action, shape (act_dim,)
     :return: root attribute of a file with such actions; empty for [-1, 1], which needs none

@@ -72,8 +72,10 @@ def cached_rows(
 
 def is_wanted(options: ReadOptions) -> bool:
     """
+    Whether finished rows are to be kept: as ``cache`` says or, if it is None, ``$SB3_DCE_ROW_CACHE``, by default not.
+
     :param options: ``cache`` wins over the environment variable
-    :return: whether rows are to be kept
+    :return: True to keep and to look for them
     :raises ConfigError: if the variable is neither on nor off
     """
     if options.cache is not None:

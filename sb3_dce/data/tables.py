@@ -278,6 +278,8 @@ def _numbers(column: pd.Series[Any], key: str, where: str) -> np.ndarray:
 
 def numbered(ids: np.ndarray) -> np.ndarray:
     """
+    Numbers that are equal where the ids of two rows are; ids that are numbers already stay what they are, NaN included.
+
     :param ids: of episodes, numbers or texts, shape (n,)
     :return: a number for each, shape (n,)
     :raises DatasetSemanticsError: if one is missing
@@ -325,9 +327,7 @@ class _Records:
 
     @property
     def lines_read(self) -> int:
-        """
-        :return: lines up to the end of the last record
-        """
+        """Lines up to the end of the last record, blank ones included; after the column names, those to skip."""
         return int(self._reader.line_num)
 
     def __iter__(self) -> Iterator[list[str]]:

@@ -14,6 +14,8 @@ DIVIDED = "the 5 % of the test are divided among all comparisons of the claim"
 
 def leading(evidence: Evidence) -> list[Verdict]:
     """
+    What DCE's place among the paper's agents says on three groups of the Gym sets.
+
     :param evidence: of the Gym table
     :return: verdicts on C4, C5 and C6
     """
@@ -56,15 +58,15 @@ class Field:
 
     @property
     def agents(self) -> list[Variant]:
-        """
-        :return: DCE and the others
-        """
+        """DCE, then the other agents that have a column in the paper's tables; further forms of DCE have none."""
         return [self.dce, *self.others]
 
     def place(self, dataset_id: str) -> int:
         """
+        DCE's place by the mean over seeds; agents that diverged on a seed, or have no scores, are behind all others.
+
         :param dataset_id: data
-        :return: DCE's place by the mean over seeds; an agent that diverged on a seed has none before it
+        :return: 1 for the first; agents with equal means share a place
         """
         means = {v.name: self._mean(v, dataset_id) for v in self.agents}
         return 1 + sum(means[v.name] > means["DCE"] for v in self.others)
@@ -75,15 +77,19 @@ class Field:
 
     def is_first(self, dataset_id: str) -> bool:
         """
+        Whether DCE is above every other agent by more than seeds could do; one that diverged on a seed is below.
+
         :param dataset_id: data
-        :return: whether DCE is above every other agent, all of which have scores, by more than seeds could do
+        :return: false, too, where one of the others has neither scores nor diverged
         """
         return all(self._is_above(self.dce, v, dataset_id) for v in self.others)
 
     def is_beaten(self, dataset_id: str) -> bool:
         """
+        Whether an agent is above DCE by more than seeds could do, or DCE has failed, having diverged on a seed.
+
         :param dataset_id: data
-        :return: whether an agent is above DCE by more than seeds could do; a DCE that diverged on a seed has failed
+        :return: true as soon as one agent is, whether the others have runs or not
         """
         failed = self.evidence.n_diverged(self.dce, dataset_id) > 0
         return failed or any(self._is_above(v, self.dce, dataset_id) for v in self.others)
@@ -100,6 +106,8 @@ class Field:
 
     def numbers(self) -> str:
         """
+        What stands beside a verdict; without runs of DCE it says that there are none.
+
         :return: DCE's places, those of one length and one number of seeds together, and which agents have no runs
         """
         if not self.ids:

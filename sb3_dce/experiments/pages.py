@@ -35,6 +35,8 @@ def write_page(
     path: Path, out: Path, evidences: Mapping[str, Evidence], reports: Mapping[str, Report], scale: str, command: str
 ) -> None:
     """
+    Write the results page: how to read it, the paper's claims and its own tables, then a section for each experiment.
+
     :param path: page to write
     :param out: folder with ``figures/`` and ``tables/``, linked from the page
     :param evidences: by experiment
@@ -72,8 +74,10 @@ def write_page(
 
 def coverage(evidences: Mapping[str, Evidence]) -> list[str]:
     """
-    :param evidences: by experiment
-    :return: for each table how much of it has runs, in words
+    On how many data sets of a table there are runs, in all and of each agent of the paper.
+
+    :param evidences: by experiment; those without a table are passed over
+    :return: a sentence for each table
     """
     found = []
     for evidence in (e for e in evidences.values() if e.experiment.report == "table"):
@@ -118,8 +122,10 @@ def _section(name: str, evidence: Evidence, report: Report, scale: str, link: st
 
 def verdict_table(judged: list[Verdict]) -> TextTable:
     """
+    Claims with outcomes in bold, and the numbers and rule behind each; checks, which no run could refute, are marked.
+
     :param judged: verdicts
-    :return: as a table
+    :return: one row each, no caption
     """
     rows = tuple((v.claim, f"**{v.outcome}**" + (" (a check)" if v.is_check else ""), v.numbers, v.rule) for v in judged)
     return TextTable(("claim", "outcome", "numbers", "rule"), rows, "")

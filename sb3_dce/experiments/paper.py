@@ -36,6 +36,8 @@ class PaperScore(NamedTuple):
 
 def read_csv(name: str) -> list[dict[str, str]]:
     """
+    Facts typed from the paper, one dictionary per line of the file, with the words of its first line as keys.
+
     :param name: file in ``paper_facts``
     :return: its rows, as text
     """
@@ -46,7 +48,9 @@ def read_csv(name: str) -> list[dict[str, str]]:
 @cache
 def paper_scores() -> dict[tuple[str, str, str], PaperScore]:
     """
-    :return: (table, dataset, method) to cell; "runtime-s" is a dataset too
+    All cells of both tables, read once; the printed totals and "runtime-s" are among them as datasets.
+
+    :return: (table, dataset, method) to cell
     """
     return {
         (row["table"], row["dataset"], row["method"]): PaperScore(
@@ -60,9 +64,11 @@ def paper_scores() -> dict[tuple[str, str, str], PaperScore]:
 
 def paper_score(dataset: str, method: str) -> PaperScore | None:
     """
+    What the paper prints for an agent on a dataset, whichever of its tables has that.
+
     :param dataset: D4RL id
     :param method: the paper's name of the agent
-    :return: cell of either table, ``None`` if there is none
+    :return: cell, without a score where it is a dash; ``None`` if there is none
     """
     for table in TABLES.values():
         found = paper_scores().get((table, dataset, method))
@@ -72,18 +78,18 @@ def paper_score(dataset: str, method: str) -> PaperScore | None:
 
 
 def gym_rows() -> list[str]:
-    """
-    :return: the twelve datasets of Table 1, in its order
-    """
+    """The twelve datasets of Table 1, in its order, without its lines of totals and run times."""
     names = dict.fromkeys(dataset for table, dataset, _ in paper_scores() if table == "gym")
     return [name for name in names if name.endswith("-v2")]
 
 
 def paper_total(method: str, datasets: list[str]) -> Total | None:
     """
+    Sum over the printed rows, since not every printed total agrees with them; a deviation that is not printed adds nothing.
+
     :param method: the paper's name of the agent
     :param datasets: rows
-    :return: sums of its printed rows, ``None`` if one is a dash
+    :return: sums, ``None`` if one of the rows is a dash or is not there
     """
     cells = [paper_score(dataset, method) for dataset in datasets]
     known = [cell for cell in cells if cell is not None and cell.score is not None]
@@ -94,8 +100,10 @@ def paper_total(method: str, datasets: list[str]) -> Total | None:
 
 def leaders(datasets: list[str]) -> dict[str, str]:
     """
+    Who is first on each dataset by the printed scores, whatever is bold; of equal ones the first in ``METHODS``.
+
     :param datasets: rows
-    :return: dataset to the method with the highest printed score
+    :return: dataset to method
     """
     best = {}
     for dataset in datasets:

@@ -39,6 +39,8 @@ COMMON = (
 
 class Report(NamedTuple):
     """
+    What an experiment comes to, before any of it is written to files.
+
     :param tables: by name
     :param has_figure: whether there is anything to draw in its panels
     :param caption: of the figure
@@ -53,8 +55,10 @@ class Report(NamedTuple):
 
 def make_report(evidence: Evidence) -> Report:
     """
+    All that the kind of an experiment (``report`` in its grid) calls for; what has no rows says so.
+
     :param evidence: rows of one experiment
-    :return: its report; where there are no rows, tables and figure say so
+    :return: tables, caption and verdicts; the figure itself is drawn by :func:`sb3_dce.experiments.figures.draw`
     """
     kind = evidence.experiment.report
     drawn = drawn_in(evidence)
@@ -84,6 +88,8 @@ def make_report(evidence: Evidence) -> Report:
 
 def drawn_in(evidence: Evidence) -> tuple[pd.DataFrame, list[Variant]] | None:
     """
+    What the caption of a figure is about; each panel has runs of the length that its own variants have.
+
     :param evidence: rows of one experiment
     :return: rows of the runs that have a line in any panel, and the variants of these panels; ``None`` if all are empty
     """
@@ -106,9 +112,11 @@ def drawn_in(evidence: Evidence) -> tuple[pd.DataFrame, list[Variant]] | None:
 
 def reproduction(evidence: Evidence) -> Verdict:
     """
+    Whether DCE's scores are the paper's, row by row on D4RL's own files, after as many steps and with at least as many seeds.
+
     :param evidence: of a table
-    :return: on how many of DCE's rows our interval meets the paper's mean and deviation; D4RL's files only, and only runs of
-        the paper's length
+    :return: on how many of DCE's rows our interval meets the paper's mean and deviation; one with a run that diverged does
+        not, whatever its number of seeds
     """
     hits: list[str] = []
     misses: list[str] = []
@@ -143,7 +151,9 @@ def reproduction(evidence: Evidence) -> Verdict:
 
 def bounds_table() -> TextTable:
     """
-    :return: bounds of Eq. 14, 16 and 17 for the betas of the figures
+    Bounds of Eq. 14, 16 and 17 for the betas of the figures, from the formulas alone.
+
+    :return: one row per beta, theory units; bounds in reward units
     """
     sampling = sampling_bound(1.0, 1.0, 1.0, 0.7, 0.99, 100)
     rows = []
@@ -193,7 +203,9 @@ def _toy_verdict(table: TextTable) -> Verdict:
 
 def config_table() -> TextTable:
     """
-    :return: the 23 rows as printed, as in our file, and whether the schedules agree
+    The 23 rows as printed and as in our file, the schedule of beta compared value by value at the printed epochs.
+
+    :return: one row per dataset, with "yes" at its end if alpha and schedule agree
     """
     schedules = {row.pop("dataset"): row for row in read_csv("beta_schedules.csv")}
     rows = []
@@ -219,7 +231,9 @@ def config_table() -> TextTable:
 
 def common_table() -> TextTable:
     """
-    :return: the common configuration as printed and as in our file
+    The configuration that all of the paper's rows share, as printed and as the file has it for halfcheetah-medium-v2.
+
+    :return: one row per parameter, "not printed" where the paper is silent
     """
     ours = row_of("dce", "halfcheetah-medium-v2")
     cells = [(text, printed, str(ours[name]), f"`{name}`") for text, printed, name in COMMON]
@@ -238,8 +252,10 @@ def _config_verdict(table: TextTable) -> Verdict:
 
 def count(judged: list[Verdict]) -> str:
     """
+    How many verdicts have each outcome, in words; checks of formulas and files are counted apart.
+
     :param judged: verdicts
-    :return: how many have each outcome, checks of formulas and files apart
+    :return: part of a sentence, without its full stop
     """
     claims, checks = ([v for v in judged if v.is_check == wanted] for wanted in (False, True))
     numbers = {outcome: sum(v.outcome == outcome for v in claims) for outcome in (HELD, NOT_HELD, CLOSE, UNTESTED)}

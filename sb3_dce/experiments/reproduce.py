@@ -101,9 +101,11 @@ class Request:
 
 def parse_ids(text: str) -> tuple[str, ...]:
     """
+    Experiments in the order in which they are named; "all" has that of the results page.
+
     :param text: an experiment, several separated by commas, or "all"
     :return: names
-    :raises ConfigError: for an unknown one
+    :raises ConfigError: for an unknown one, for none, and for "all" among others
     """
     names = tuple(name.strip() for name in text.split(",") if name.strip())
     if not names:
@@ -188,6 +190,8 @@ def _check_request(request: Request) -> None:
 
 def hash_here(dataset_id: str) -> str | None:
     """
+    Which version of a dataset is here: of runs on several versions, a table shows those on this one.
+
     :param dataset_id: id of the catalogue
     :return: SHA-256 of its file on this machine, ``None`` if there is none
     """
@@ -221,7 +225,9 @@ def _train(
 
 def show_list(console: Console) -> None:
     """
-    :param console: where the experiments are listed, with their runs at each scale and the data that are here
+    What ``sb3-dce reproduce --list`` prints: all experiments, with their runs at each scale and the data that are here.
+
+    :param console: where it is printed
     """
     view = Table(box=None, header_style="bold")
     for title in ("id", "items", "what", "runs: smoke", "cpu", "full", "data here"):
@@ -246,6 +252,8 @@ def _count(experiment: Experiment, scale: Scale) -> int:
 
 def scale_of(experiment: Experiment, request: Request) -> Scale:
     """
+    How much is run; where no interval is given, runs shorter than the scale's are evaluated once, at their end.
+
     :param experiment: one of the request's
     :param request: with its changes of length, evaluations and seeds
     :return: the scale with them
@@ -261,10 +269,12 @@ def scale_of(experiment: Experiment, request: Request) -> Scale:
 
 def plan_runs(experiment: Experiment, scale: Scale, request: Request) -> list[PlannedRun]:
     """
+    The part of a grid that is asked for, runs that are complete among it; a grid without data has no runs.
+
     :param experiment: one of the request's
     :param scale: with the request's changes
     :param request: with its choice of data, agents and seeds
-    :return: runs
+    :return: runs, those that others need first
     :raises ConfigError: for an agent or a dataset that is not in the grid
     """
     if not experiment.datasets:

@@ -66,6 +66,8 @@ class ResultsError(SB3DCEError, ValueError):
 
 def rows_of_run(folder: Path, experiment: str) -> pd.DataFrame | None:
     """
+    All that is kept of a run, once it has ended: scores, diagnostics, time and facts about its data, to six digits.
+
     :param folder: of one run, as :func:`sb3_dce.runs.run` writes it
     :param experiment: id of the experiment it is run for
     :return: its rows; ``None`` unless it is complete or has diverged
@@ -106,10 +108,12 @@ def rows_of_run(folder: Path, experiment: str) -> pd.DataFrame | None:
 
 def import_runs(folder: Path, experiment: str, planned: Iterable[PlannedRun] = ()) -> pd.DataFrame:
     """
+    Rows of every run in a folder or below it, whichever command made it; what has not ended yet is passed over.
+
     :param folder: anywhere above folders of runs
     :param experiment: id of the experiment they are taken for
     :param planned: runs of grids, which are taken for these
-    :return: rows of all complete runs below
+    :return: rows of those that are complete or have diverged, each run once
     """
     of_plan = _experiments(planned)
     folders = [path.parent for path in sorted(folder.rglob("config.yml"))]
@@ -119,8 +123,10 @@ def import_runs(folder: Path, experiment: str, planned: Iterable[PlannedRun] = (
 
 def planned_rows(planned: Iterable[PlannedRun]) -> pd.DataFrame:
     """
+    Rows of a plan from the folders of its runs, trained just now or by an earlier call.
+
     :param planned: runs of a grid
-    :return: rows of those that are complete, each run once
+    :return: rows of those that are complete or have diverged, each run once
     """
     found = [rows_of_run(folder, experiment) for folder, experiment in _experiments(planned).items()]
     return merge(rows for rows in found if rows is not None)
@@ -134,6 +140,8 @@ def _experiments(planned: Iterable[PlannedRun]) -> dict[Path, str]:
 
 def merge(parts: Iterable[pd.DataFrame]) -> pd.DataFrame:
     """
+    Put rows of several files and folders together, so that no run counts twice.
+
     :param parts: rows; where several hold the same run, that with the most episodes at its end counts, one made for
         :data:`TIMING` only if there is no other, and of equals the first
     :return: all rows, each run once
@@ -153,9 +161,11 @@ def merge(parts: Iterable[pd.DataFrame]) -> pd.DataFrame:
 
 def without(rows: pd.DataFrame, others: pd.DataFrame) -> pd.DataFrame:
     """
+    What is left of rows without the runs that others hold, told by ``RUN_KEY`` whatever their numbers are.
+
     :param rows: rows
-    :param others: rows
-    :return: the rows of runs that ``others`` does not hold
+    :param others: rows of the runs to leave out
+    :return: part of ``rows``
     """
     known = set(others[RUN_KEY].itertuples(index=False, name=None))
     keys = rows[RUN_KEY].itertuples(index=False, name=None)
@@ -164,6 +174,8 @@ def without(rows: pd.DataFrame, others: pd.DataFrame) -> pd.DataFrame:
 
 def done_runs(rows: pd.DataFrame, planned: Iterable[PlannedRun]) -> set[tuple[Any, ...]]:
     """
+    Which runs need no training; one that diverged, or that could not be evaluated, needs no episodes for that.
+
     :param rows: rows
     :param planned: runs of a grid
     :return: keys of those that the rows hold, on the file that is here now and evaluated over at least as many episodes
@@ -184,14 +196,14 @@ def done_runs(rows: pd.DataFrame, planned: Iterable[PlannedRun]) -> set[tuple[An
 
 
 def empty() -> pd.DataFrame:
-    """
-    :return: no rows
-    """
+    """No rows, with the columns and types of all others, to merge with them or to compare against."""
     return _ordered(pd.DataFrame(columns=list(COLUMNS)))
 
 
 def write_rows(path: Path, rows: pd.DataFrame) -> None:
     """
+    Write rows in the order of their runs; what is wrong with them is found before the file is touched.
+
     :param path: ``.csv.gz`` file; the same rows give the same bytes
     :param rows: rows
     :raises ResultsError: if they are not what rows have to be
@@ -205,6 +217,8 @@ def write_rows(path: Path, rows: pd.DataFrame) -> None:
 
 def read_rows(path: Path) -> pd.DataFrame:
     """
+    Read a file of rows back, with the same checks as before it was written.
+
     :param path: file that :func:`write_rows` wrote
     :return: rows
     :raises ResultsError: if it is damaged or something else
@@ -222,16 +236,20 @@ def read_rows(path: Path) -> pd.DataFrame:
 
 def has_rows(folder: Path) -> bool:
     """
+    Whether :func:`read_folder` finds files there, asked without opening them.
+
     :param folder: any
-    :return: whether :func:`read_folder` finds files there
+    :return: true also where these files hold no rows
     """
     return bool(_row_files(folder))
 
 
 def read_folder(folder: Path) -> pd.DataFrame:
     """
+    All rows of a folder; the files in its ``rows/`` are read only if it has none of its own.
+
     :param folder: with ``.csv.gz`` files in it or in ``rows/``; need not exist
-    :return: all their rows, each run once
+    :return: rows, each run once
     """
     return merge(read_rows(path) for path in _row_files(folder))
 
@@ -242,9 +260,12 @@ def _row_files(folder: Path) -> list[Path]:
 
 def check_rows(rows: pd.DataFrame, where: str) -> None:
     """
+    Refuse what would make a table wrong without a word, on the way into a file and out of it.
+
     :param rows: rows
     :param where: for the message
-    :raises ResultsError: for missing columns, numbers that are none, a step twice, or a run with two configurations
+    :raises ResultsError: for other columns, numbers that are none, a hash or hyperparameters that are none, a step twice, or
+        a run with two sets of hyperparameters or two code versions
     """
 
     def refuse(what: str) -> None:
@@ -333,6 +354,8 @@ def _curves(folder: Path, n_updates: int) -> list[tuple[int, str, float]]:
 
 def read_log(folder: Path) -> pd.DataFrame:
     """
+    Put the logs of a run together, one for each time that it was begun or gone on with.
+
     :param folder: of a run
     :return: its log by gradient steps; where it was killed and went on from a checkpoint, what the resumed run wrote counts
     """

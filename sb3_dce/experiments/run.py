@@ -84,8 +84,10 @@ def execute(
 
 def is_complete(spec: RunSpec) -> bool:
     """
+    Whether there is nothing left to train; a run that has diverged is complete, since it would do so again.
+
     :param spec: of a run
-    :return: whether its folder holds all of it; a run that has diverged is complete
+    :return: true only for a result of the length that is asked for, or a divergence
     """
     folder = Path(spec.folder)
     result = read_result(folder)
@@ -152,8 +154,10 @@ def begun_populations(specs: Sequence[RunSpec], planned: Sequence[RunSpec]) -> l
 
 def populations(specs: Iterable[RunSpec]) -> list[list[RunSpec]]:
     """
+    Groups of runs that differ in nothing but data, seed and free parameters, cut where one would be too large.
+
     :param specs: runs
-    :return: groups that can be trained as one population each
+    :return: groups that can be trained as one population each; one of a single run is trained alone
     """
     groups: dict[Any, list[RunSpec]] = {}
     for spec in specs:
@@ -173,8 +177,10 @@ def populations(specs: Iterable[RunSpec]) -> list[list[RunSpec]]:
 
 def population_file(group: Sequence[RunSpec]) -> str:
     """
+    Name of a population's state file, by a hash of its members' folders: the same in whatever order they come.
+
     :param group: members of a population
-    :return: name of its state file, the same for the same members
+    :return: file name, to go beside the folders of the members
     """
     names = sorted(Path(spec.folder).name for spec in group)
     return STATE_FILES.format(hashlib.sha256(" ".join(names).encode()).hexdigest()[:12])

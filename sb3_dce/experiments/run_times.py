@@ -21,8 +21,10 @@ HASTENED = tuple(name for name in PRECISIONS if name != "float32")
 
 def runtime_table(evidence: Evidence) -> TextTable:
     """
-    :param evidence: rows of whole agents
-    :return: seconds per 1000 updates beside the paper's, one row per agent, device and precision
+    Seconds per 1000 updates beside the paper's; what hastens an agent stands with its device.
+
+    :param evidence: rows of whole agents; those without a column in the paper's tables are left out
+    :return: one row per agent, device and precision
     """
     rows = []
     ids = [name for _, name in evidence.table_rows()]
@@ -51,15 +53,19 @@ def runtime_table(evidence: Evidence) -> TextTable:
 
 def has_fewer_draws(evidence: Evidence, variant: Variant) -> bool:
     """
+    Whether the scale sets the number of dropout passes or OOD actions, so that updates are cheaper than the authors'.
+
     :param evidence: rows at a scale
     :param variant: agent
-    :return: whether the scale makes each of its updates cheaper than the authors'
+    :return: whether one of these is in the scale's settings for the agent
     """
     return bool(evidence.scale.set_for.get(variant.algo, {}).keys() & {"n_mc_dropout", "n_ood_actions"})
 
 
 class RunTime(NamedTuple):
     """
+    What the updates of one run cost, with its evaluations.
+
     :param seconds: per 1000 updates
     :param device: and precision
     :param hastened: whether rounded products or settings of the scale make it faster than the authors' agent in float32
@@ -71,19 +77,18 @@ class RunTime(NamedTuple):
 
     @property
     def text(self) -> str:
-        """
-        :return: seconds and device
-        """
+        """Seconds and device; a hastened run says "fewer draws", unless its device has the precision that hastens it."""
         return f"{self.seconds:.1f} s ({self.device}{', fewer draws' if self.hastened and ' ' not in self.device else ''})"
 
 
 def run_times(evidence: Evidence, variant: Variant, dataset_ids: list[str]) -> list[RunTime]:
     """
+    Times of an agent's runs that were trained alone: members of a population have its time together.
+
     :param evidence: rows
     :param variant: agent
     :param dataset_ids: data
-    :return: of each complete run that is shown, of the row's length or else its longest, and that was trained alone: members
-        of a population have its time together
+    :return: of each complete run that is shown, of the row's length or else its longest
     """
     # smoke scale has small networks
     fewer, runs = has_fewer_draws(evidence, variant) or evidence.scale.source == "embedded", []
@@ -97,10 +102,12 @@ def run_times(evidence: Evidence, variant: Variant, dataset_ids: list[str]) -> l
 
 def fastest_runs(evidence: Evidence, names: Iterable[str]) -> dict[str, RunTime]:
     """
+    The times by which agents are compared: of each the least, since other work on the machine can only add to it.
+
     :param evidence: rows
     :param names: of variants
-    :return: of each variant the run that others disturbed least, of those with the authors' settings in float32; all on one
-        file and one kind of device, the one with most of them
+    :return: by variant, of its runs with the authors' settings in float32; all on one file and one kind of device, the one
+        with most of the variants
     """
     ids = [dataset_id] if (dataset_id := evidence.id_of(None)) is not None else []
     by_device: dict[str, dict[str, RunTime]] = {}

@@ -29,24 +29,30 @@ class Interval(NamedTuple):
 
     def overlaps(self, other: Interval) -> bool:
         """
+        Whether two intervals have a point in common; ends that touch are one.
+
         :param other: another interval
-        :return: whether they have a point in common
+        :return: the same whichever of the two is asked
         """
         return self.low <= other.high and other.low <= self.high
 
 
 def sample_std(values: np.ndarray) -> float:
     """
+    Standard deviation over seeds with divisor n - 1, the ± of the tables.
+
     :param values: one number per seed, shape (n,)
-    :return: standard deviation with divisor n - 1; NaN for one seed
+    :return: in the units of the values; NaN for one seed
     """
     return float(student.sample_std(values))
 
 
 def mean_interval(scores: np.ndarray) -> Interval:
     """
+    95 % interval of the mean over seeds by Student's t with n - 1 degrees of freedom.
+
     :param scores: of one task, one number per seed, at least two
-    :return: 95 % interval of the mean by Student's t
+    :return: bounds
     """
     low, high = student.mean_interval(scores)
     return Interval(float(low), float(high))
@@ -82,8 +88,10 @@ def iqm(scores: Scores) -> np.ndarray:
 
 def mean_of_tasks(scores: Scores) -> np.ndarray:
     """
+    Mean over tasks of the mean over seeds: each task has the same weight, whatever its number of seeds.
+
     :param scores: one array per task, each of shape (..., seeds)
-    :return: mean over tasks of the mean over seeds, shape (...)
+    :return: shape (...)
     """
     return np.mean([np.mean(task, axis=-1) for task in scores], axis=0)
 
@@ -123,9 +131,11 @@ def probability_of_improvement(scores: Scores, others: Scores) -> float:
 
 def performance_profile(scores: Scores, thresholds: np.ndarray) -> np.ndarray:
     """
+    Fraction of the runs above each threshold, equal to it not counted; mean over tasks (Agarwal et al. 2021).
+
     :param scores: one array per task
     :param thresholds: scores, shape (n,)
-    :return: fraction of the runs above each threshold, mean over tasks, shape (n,)
+    :return: in [0, 1], shape (n,)
     """
     limits = np.asarray(thresholds, dtype=float)[None, :]
     shares = [(np.asarray(task, dtype=float)[:, None] > limits).mean(axis=0) for task in scores]
@@ -148,6 +158,8 @@ class Total(NamedTuple):
 
 def total(means: Sequence[float], stds: Sequence[float]) -> Total:
     """
+    Total of a table's rows with two deviations: the paper's plain sum, and that of a sum of independent rows.
+
     :param means: of the rows
     :param stds: sample standard deviations of the rows; NaN (one seed, or none printed) counts as 0
     :return: sums
