@@ -29,6 +29,8 @@ TRAINED = ("critic", "critic_target", "value_net")
 
 def probe_name(network: str, beta: int) -> str:
     """
+    Attribute under which the policy and the state tree keep a network of one beta's set.
+
     :param network: "critic", "critic_target" or "value_net"
     :param beta: penalty weight of its set; 0 is the agent's own
     :return: name of the network
@@ -138,6 +140,8 @@ class OfflineDCEProbe(OfflineDCE):
 
     def set_best_policy(self, agent: OfflineDCE) -> None:
         """
+        Copy an agent's actor into the frozen ``actor_best``; until then this is the actor at the start.
+
         :param agent: trained agent with an actor of the same shape, whose deterministic actions are probed from now on
         """
         self.actor_best.load_state_dict(agent.actor.state_dict())

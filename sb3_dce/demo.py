@@ -39,10 +39,12 @@ DCE_ONLY: dict[str, Any] = {"beta": 1.0, "beta_final": None, "beta_rate": 0.0, "
 
 def demo_spec(algo: str, seed: int, folder: Path) -> RunSpec:
     """
+    One run of the demo: small networks and a large step for both agents, for DCE also a constant beta and a larger ``tau``.
+
     :param algo: "dce" or "offline_bc"
     :param seed: seed of the run
     :param folder: folder of the demo
-    :return: the run of the demo with this agent and seed
+    :return: the run with this agent and seed, in the folder ``<algo>_<seed>`` below that of the demo
     """
     overrides = {**SHARED, **(DCE_ONLY if algo == "dce" else {})}
     return RunSpec(algo, DATASET, seed, N_UPDATES, str(folder / f"{algo}_{seed}"), EVAL_FREQ, N_EVAL_EPISODES, overrides)

@@ -26,6 +26,8 @@ class DiagnosticsMixin(AttachingMixin):
 
     def derived_metrics(self, means: dict[str, float]) -> dict[str, float]:
         """
+        Diagnostics made once per log row instead of in every update, such as ``survival_margin``; none by default.
+
         :param means: metrics of the last interval
         :return: further ones computed from them
         """
@@ -33,6 +35,8 @@ class DiagnosticsMixin(AttachingMixin):
 
     def divergence(self, names: list[str]) -> DivergenceError:
         """
+        Put the model back to before the update that diverged, where this can be found, and make the error.
+
         :param names: metrics that are not finite
         :return: what is to be raised
         """

@@ -48,6 +48,8 @@ class Rewind(NamedTuple):
     @classmethod
     def of(cls, model: OfflineAlgorithm, engine: Engine[TrainState], batch_size: int) -> Rewind:
         """
+        Snapshot for :func:`locate`, taken before the first update and again after each check that found all metrics finite.
+
         :param model: about to be trained
         :param engine: what makes its updates
         :param batch_size: rows per update
@@ -60,6 +62,8 @@ class Rewind(NamedTuple):
 
     def restore(self, model: OfflineAlgorithm) -> None:
         """
+        Write the copies back in place and forget the metrics summed since; this can be done any number of times.
+
         :param model: put back, but for its count of timesteps
         """
         for tensor, saved in zip(tree_leaves(self.engine.state.read()), self.tensors, strict=True):
@@ -86,9 +90,7 @@ class Rewind(NamedTuple):
         return not_finite(self.engine.metrics.read())
 
     def is_finite(self) -> bool:
-        """
-        :return: whether the state is now
-        """
+        """Whether parameters, targets and moments are finite now: a step that overflows shows in no metric of its update."""
         return _are_finite(tree_leaves(self.engine.state.read()))
 
 
@@ -98,6 +100,8 @@ def _are_finite(tensors: list[th.Tensor]) -> bool:
 
 def not_finite(metrics: dict[str, float]) -> list[str]:
     """
+    Metrics that tell of a divergence; an empty list while training is sound.
+
     :param metrics: values by name
     :return: names of those that are NaN or infinite
     """

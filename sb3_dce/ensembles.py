@@ -48,13 +48,17 @@ class EnsembleNet:
 
     def is_batched(self, device: th.device) -> bool:
         """
+        Batched products need a device on which they pay, and critics whose parameters all belong to linear layers.
+
         :param device: device of the parameters
-        :return: whether the critics are run as batched products
+        :return: whether the critics are run as batched products, else one after the other
         """
         return self._plain and batched_products_pay(device)
 
     def __call__(self, flat: th.Tensor, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
+        Q of all critics, stacked, as a differentiable function of the flat vector; both ways agree up to rounding.
+
         :param flat: shape (n_parameters,)
         :param obs: shape (batch, *obs_shape)
         :param actions: scaled to [-1, 1], shape (batch, action_dim)

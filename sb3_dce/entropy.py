@@ -20,6 +20,8 @@ ENT_COEF = "log_ent_coef"  # name of the learner in the state tree
 
 def parse_ent_coef(ent_coef: str | float) -> tuple[bool, float]:
     """
+    Tell a fixed temperature from a learned one; ``"auto"`` starts at 1.0, as in Stable-Baselines3's SAC.
+
     :param ent_coef: a number, ``"auto"``, or ``"auto_0.1"``
     :return: whether it is learned, and its (first) value
     :raises ConfigError: for anything else
@@ -50,6 +52,8 @@ class EntropyCoefficient(OfflineAlgorithm):
 
     def check_parameters(self) -> None:
         """
+        Also refuse an ``ent_coef`` below 0, or 0 where it is learned, and a ``target_entropy`` that is not finite.
+
         :raises ConfigError: if a parameter is out of its range
         """
         super().check_parameters()
@@ -68,6 +72,8 @@ class EntropyCoefficient(OfflineAlgorithm):
 
     def learned_numbers(self) -> dict[str, LearnedNumber]:
         """
+        Add ``log_ent_coef``, the logarithm of the temperature; its start is ``None`` where the temperature is fixed.
+
         :return: numbers learned beside the networks, by the attribute of their tensor
         """
         learned, value = parse_ent_coef(self.ent_coef)
@@ -78,6 +84,8 @@ class EntropyCoefficient(OfflineAlgorithm):
 
     def coefficients(self, n_updates: int) -> dict[str, float]:
         """
+        Add the temperature where it is fixed, else the target entropy (``"auto"`` is minus the action dimension, nats).
+
         :param n_updates: completed updates
         :return: numbers of the next update that may change while training
         """

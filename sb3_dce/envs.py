@@ -62,6 +62,8 @@ class SpacesEnv(gym.Env):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """
+        Answer with one valid observation, always the same, as Stable-Baselines3 asks for one when ``learn()`` begins.
+
         :param seed: seed of ``self.np_random``
         :param options: unused
         :return: the observation of the space nearest to zero, and an empty dictionary
@@ -71,6 +73,8 @@ class SpacesEnv(gym.Env):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """
+        Refuse, since there are no dynamics; offline training never comes here, an evaluation would.
+
         :param action: any
         :raises RuntimeError: always
         """
@@ -279,6 +283,8 @@ def make_recorded_env(path: str | PathLike[str]) -> gym.Env | None:
 
 def missing_simulator(spec: DatasetSpec) -> MissingSimulator | None:
     """
+    Import what the environment of a dataset needs, and say what is not installed, or that no simulator fits the data.
+
     :param spec: catalogue entry
     :return: what the environment lacks to run, or ``None`` if it can
     """

@@ -43,23 +43,17 @@ class Evaluation:
 
     @property
     def mean(self) -> float:
-        """
-        :return: mean return
-        """
+        """Undiscounted return, mean over the episodes, reward units."""
         return float(np.mean(self.returns))
 
     @property
     def std(self) -> float:
-        """
-        :return: standard deviation over the episodes
-        """
+        """Standard deviation of the return over the episodes (``ddof=0``), reward units."""
         return float(np.std(self.returns))
 
     @property
     def score(self) -> float | None:
-        """
-        :return: D4RL's normalised score of the mean return (100 = expert), ``None`` without reference values
-        """
+        """D4RL's normalised score of the mean return (0 = random, 100 = expert), ``None`` without reference values."""
         return None if self.dataset_id is None else float(normalized_score(self.dataset_id, self.mean))
 
 
@@ -82,6 +76,8 @@ def evaluate(model: Any, rollouts: Rollouts, seed: int, dataset_id: str | None =
 
 def evaluation_seed(run_seed: int, index: int) -> int:
     """
+    Start of an evaluation's own block of 10,000 seeds, ``10000 * (index + 1000 * run_seed)`` for index below 1000.
+
     :param run_seed: seed of the run
     :param index: number of the evaluation within the run
     :return: seed of its first episode; no other evaluation of any run has it
@@ -171,6 +167,8 @@ class EvaluationCallback(BaseCallback):
 
 def write_evaluations(folder: Path, evaluations: list[Evaluation]) -> None:
     """
+    Replace ``evaluations.npz``, in the layout of Stable-Baselines3's ``EvalCallback``, and ``evaluations.csv``.
+
     :param folder: existing folder
     :param evaluations: all evaluations of the run
     """
@@ -193,6 +191,8 @@ def write_evaluations(folder: Path, evaluations: list[Evaluation]) -> None:
 
 def read_evaluations(folder: Path, dataset_id: str | None) -> list[Evaluation]:
     """
+    Outcomes in ``evaluations.npz``, with which a resumed run goes on; none where there is no such file.
+
     :param folder: folder of a run
     :param dataset_id: defines the score
     :return: its evaluations so far

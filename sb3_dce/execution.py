@@ -46,6 +46,8 @@ def bound_update(
     update: Callable[..., Any], options: UpdateOptions, nets: dict[str, Any], storages: dict[str, Storage]
 ) -> Update:
     """
+    Fix what stays the same in every call of an update: options, networks and constants of the optimizers.
+
     :param update: pure update of an algorithm, ``update(options, nets, settings, state, batch, noise, coef, **variant)``
     :param options: choices fixed at trace time
     :param nets: networks as functions of their flat parameters, by name
@@ -74,6 +76,8 @@ MAX_COMPILED_UPDATES = 200
 
 def choose_execution(execution: str, planned_updates: int, device: th.device) -> str:
     """
+    Decide ``"auto"`` by the device and the length of the run, and replace what this machine cannot do.
+
     :param execution: "auto", "eager", "compile" or "cudagraph"
     :param planned_updates: updates the caller is going to run
     :param device: where the model lies
@@ -122,6 +126,8 @@ class State(Protocol):
 
     def read(self) -> dict[str, Any]:
         """
+        The state tree that an update gets; its tensors are the stored ones, into which the engine copies the new values.
+
         :return: name -> learner or flat vector
         """
 
@@ -155,6 +161,8 @@ class Engine(Generic[S]):
 
     def has_run(self, variant: dict[str, Any]) -> bool:
         """
+        Asked before an update is shielded from interrupts, since the first one of a variant may compile for a minute.
+
         :param variant: choices of an update
         :return: whether such an update was made, so that nothing is left to be compiled or captured
         """

@@ -113,30 +113,30 @@ class OfflineSACPolicy(SACPolicy):
 
     def make_optimizer(self, network: nn.Module, lr_schedule: Schedule) -> th.optim.Optimizer:
         """
+        The optimizer that Stable-Baselines3 gives actor and critics, for a network that it does not build itself.
+
         :param network: whose parameters are trained
-        :param lr_schedule: learning rate as a function of the remaining progress
+        :param lr_schedule: learning rate as a function of the remaining progress; the optimizer begins with that of the start
         :return: optimizer of the policy's class, with its arguments
         """
         return self.optimizer_class(network.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
 
     @property
     def critic_arch(self) -> list[int]:
-        """
-        :return: widths of the critics' hidden layers
-        """
+        """Widths of the critics' hidden layers: ``net_arch`` itself, or its ``qf`` entry if it is a dictionary."""
         return get_actor_critic_arch(self.net_arch)[1]
 
     def make_value_net(self) -> ValueNet:
-        """
-        :return: a new state-value network with the critics' hidden layers
-        """
+        """A new state-value network with the critics' hidden layers; its target, if there is one, is made by a second call."""
         kwargs = self._update_features_extractor(self.net_args, None)
         kwargs["net_arch"] = self.critic_arch
         return ValueNet(**kwargs).to(self.device)
 
     def set_training_mode(self, mode: bool) -> None:
         """
-        :param mode: True for training, False for evaluation; the targets always stay in evaluation mode
+        Switch actor, critics and V between training and evaluation; the targets always stay in evaluation mode.
+
+        :param mode: True for training, False for evaluation
         """
         super().set_training_mode(mode)
         if self.value_net is not None:
@@ -178,6 +178,8 @@ class ActorPolicy(OfflineSACPolicy):
 
     def set_training_mode(self, mode: bool) -> None:
         """
+        Switch the actor, the only network there is; the base class would look for critics.
+
         :param mode: True for training, False for evaluation
         """
         self.actor.set_training_mode(mode)
@@ -220,9 +222,7 @@ class OfflineIQLPolicy(OfflineSACPolicy):
         return _orthogonal(super().make_critic(features_extractor))
 
     def make_value_net(self) -> ValueNet:
-        """
-        :return: a new state-value network with the critics' hidden layers
-        """
+        """The state-value network of the base class, with orthogonal weights (gain sqrt(2)) and biases of 0."""
         return _orthogonal(super().make_value_net())
 
 

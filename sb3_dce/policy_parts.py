@@ -46,6 +46,8 @@ _UNKNOWN: Any = object()
 
 def actor_parts(policy: Any) -> tuple[list[Any], Layer | np.ndarray | None, Any, Squash] | None:
     """
+    Take the actor of a known policy apart into what its NumPy twin or a snapshot needs to act.
+
     :param policy: policy of Stable-Baselines3 or of this package
     :return: modules of the mean, log std, features extractor, and the way of squashing; ``None`` for an unknown policy, or
         one whose observations or actions are no vectors
@@ -124,6 +126,8 @@ def _extractor_normalizer(extractor: Any) -> Any:
 
 def plain_layers(modules: list[Any]) -> tuple[list[Any], str] | None:
     """
+    Tell whether modules alternate between linear layers and one activation with its default settings.
+
     :param modules: of an MLP, in order
     :return: its linear layers and the activation between all of them, a key of :data:`~sb3_dce.numpy_policy.ACTIVATIONS`;
         ``None`` for any other order or kind of modules

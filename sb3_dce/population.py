@@ -53,15 +53,14 @@ class StackedState:
         self._tree = tree_map(lambda *leaves: th.stack(leaves).to(device), *trees)
 
     def read(self) -> dict[str, Any]:
-        """
-        :return: name -> learner or flat vectors, in place
-        """
+        """Name to learner or flat vectors of all members: the tensors themselves, which an update overwrites."""
         return self._tree
 
     def member(self, index: int) -> dict[str, Learner | th.Tensor]:
         """
+        The state tree of one member, without the model dimension: views of the stacked tensors.
+
         :param index: number of the member
-        :return: its slice, views
         """
         return tree_map(lambda leaf: leaf[index], self._tree)
 
@@ -112,9 +111,7 @@ class Population:
 
     @property
     def n_updates(self) -> int:
-        """
-        :return: completed updates of each member
-        """
+        """Completed updates, the same number for each member; those made before the members were put together count."""
         return self._n_updates
 
     # -- training --------------------------------------------------------------------------------------------------
@@ -252,8 +249,10 @@ class Population:
 
     def read_metrics(self) -> list[dict[str, float]]:
         """
-        :return: of each member the mean of every diagnostic since the last call; NaN and infinity are passed on, since one
-            member that diverges is no reason to stop the others
+        Mean of every diagnostic since the last call, and what the agent derives from these means, member by member.
+
+        :return: name -> value for each member, empty before the first update; NaN and infinity are passed on, since one member
+            that diverges is no reason to stop the others
         """
         if self._engine is None:
             return [{} for _ in self.models]
@@ -262,35 +261,37 @@ class Population:
         return [{**m, **model.derived_metrics(m)} if m else m for m, model in zip(members, self.models, strict=True)]
 
     def random_state(self) -> th.Tensor:
-        """
-        :return: state of the common generator
-        """
+        """State of the generator of the common draws, which a checkpoint keeps to go on with the same numbers."""
         return self._generator.get_state()
 
     def set_random_state(self, state: th.Tensor) -> None:
         """
-        :param state: as returned by :meth:`random_state`
+        Go on with the common draws of an interrupted population.
+
+        :param state: as returned by :meth:`random_state`, on the same kind of device
         """
         self._generator.set_state(state)
 
     def memory(self) -> dict[str, int]:
-        """
-        :return: bytes on the device: rows of the data, state of the networks
-        """
+        """Bytes on the device: ``data``, rows that members may share, and ``networks``, the state of all members."""
         state = sum(leaf.numel() * leaf.element_size() for leaf in tree_leaves(self.state.read()))
         return {"data": self._rows.numel() * self._rows.element_size(), "networks": state}
 
 
 def free_parameters(cls: type[OfflineAlgorithm]) -> frozenset[str]:
     """
-    :param cls: agent
-    :return: parameters in which the members of a population may differ
+    Parameters in which members of a population may differ: :data:`SCALARS`, and the agent's ``population_scalars``.
+
+    :param cls: agent; those of its bases count, too
+    :return: names of constructor arguments
     """
     return SCALARS.union(*(getattr(base, "population_scalars", ()) for base in cls.__mro__))
 
 
 def check_alike(models: Sequence[OfflineAlgorithm]) -> None:
     """
+    Refuse models that differ in more than data, seed and numbers, or stand behind a ``VecNormalize``.
+
     :param models: candidates for a population
     :raises ConfigError: if they cannot be trained in one batched computation
     """

@@ -130,7 +130,10 @@ class BatchedRuns:
 
     def run(self) -> list[dict[str, Any]]:
         """
+        Train what is not yet done, evaluating and saving on the way; if all members are complete, read their results only.
+
         :return: results in the order of the specifications
+        :raises DivergenceError: if members have diverged, now or in an earlier call; the others are complete
         """
         done = [read_result(folder) for folder in self.folders]
         ended = [read_divergence(folder) for folder in self.folders]
@@ -340,9 +343,11 @@ class BatchedRuns:
 
 def members_to_go_on(state_file: Path) -> list[Path]:
     """
+    Folders of the members of an interrupted population, if it can go on from its file and their checkpoints.
+
     :param state_file: of a population that was interrupted
-    :return: its members' folders, in its order; none if it cannot go on: the file is damaged, or a checkpoint has gone since,
-        as when some of its runs were begun anew
+    :return: folders in the order of the population; none if it cannot go on: the file is damaged, or a checkpoint has gone
+        since, as when some of its runs were begun anew
     """
     try:
         state = th.load(state_file, weights_only=True)

@@ -78,6 +78,8 @@ def matmul_precision(precision: str, device: th.device) -> Iterator[None]:
 
 def missing_for(precision: str, device: th.device) -> str | None:
     """
+    What device or PyTorch lack for a precision; as long as they lack it, training computes in float32.
+
     :param precision: as for :func:`matmul_precision`
     :param device: where the model lies
     :return: what it takes and is not here, in words; ``None`` if nothing

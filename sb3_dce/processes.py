@@ -78,17 +78,16 @@ def termination_as_interrupt() -> Iterator[None]:
 
 
 def threads_from_environment() -> int:
-    """
-    :return: what ``OMP_NUM_THREADS`` says, the first number where it is a list; 0 if it says nothing
-    """
+    """Threads that ``OMP_NUM_THREADS`` asks for, the first number where it is a list; 0 if it says nothing."""
     first = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()
     return int(first) if first.isdecimal() else 0
 
 
 def usable_cores() -> int:
     """
-    :return: cores this process may use, which a batch system or ``taskset`` may have limited; at most 61 on Windows, where a
-        pool takes no more
+    Cores this process may use, which a batch system or ``taskset`` may have limited.
+
+    :return: at least 1; at most 61 on Windows, where a pool takes no more
     """
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))

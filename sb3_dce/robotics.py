@@ -37,6 +37,8 @@ class AdroitRewardFix(gym.Wrapper, RecordConstructorArgs):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """
+        Step the simulator, and take ``0.2 * ||palm - object||`` off its reward.
+
         :param action: shape (act_dim,)
         :return: observation, corrected reward, terminated, truncated, info
         """
@@ -66,6 +68,8 @@ class PenTermination(gym.Wrapper, RecordConstructorArgs):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """
+        Step the simulator, and end the episode once the pen is below 0.075 m.
+
         :param action: shape (act_dim,)
         :return: observation, reward, whether the pen lies too low, truncated, info
         """
@@ -98,6 +102,8 @@ class KitchenObservation(gym.ObservationWrapper, RecordConstructorArgs):
 
     def observation(self, observation: dict[str, np.ndarray]) -> np.ndarray:
         """
+        Make D4RL's observation of the simulator's: all velocities are left out, the goal is appended.
+
         :param observation: "observation" holds robot positions 9, robot velocities 9, object positions 21, velocities 20
         :return: shape (60,)
         """
@@ -123,8 +129,10 @@ def fix_adroit(env: gym.Env) -> gym.Env:
 
 def kitchen_tasks(dataset_id: str) -> list[str]:
     """
+    The four tasks that pay reward in a kitchen dataset: ``mixed`` sets have the burner in place of the cabinet.
+
     :param dataset_id: id of a kitchen dataset
-    :return: its four target tasks
+    :return: their names in Gymnasium-Robotics
     """
     last_two = ["bottom burner", "light switch"] if "mixed" in dataset_id else ["light switch", "slide cabinet"]
     return ["microwave", "kettle", *last_two]

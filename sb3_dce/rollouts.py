@@ -60,8 +60,10 @@ class Ending(NamedTuple):
 
 def in_order(endings: Iterable[Ending]) -> Episodes:
     """
+    Returns and lengths in the order in which episodes ended, so that it does not matter which process played which.
+
     :param endings: of all episodes of an evaluation, which may come from several processes
-    :return: the episodes in the order in which they ended
+    :return: the same as of an evaluation in one process
     """
     ordered = sorted(endings)
     return Episodes(tuple(e.episode_return for e in ordered), tuple(e.length for e in ordered))
@@ -101,7 +103,9 @@ class Rollouts:
 
     def check_fits(self, model: Any) -> None:
         """
-        :param model: agent, or anything with ``predict``
+        Refuse a model with other spaces than the environments; bounds of observations may differ.
+
+        :param model: agent, or anything with ``predict``; without spaces it passes
         :raises ConfigError: if it sees or does other things than the environments have
         """
         hint = "Evaluate it in the environment of its own data (--dataset, --env), or use evaluate_policy(model, env)."
@@ -177,6 +181,8 @@ class Rollouts:
 
 def make_rollouts(dataset_id: str, n_episodes: int, n_envs: int | None = None) -> Rollouts | None:
     """
+    Environments in which policies trained on a dataset of the catalogue are scored.
+
     :param dataset_id: id of the catalogue
     :param n_episodes: episodes of an evaluation
     :param n_envs: environments that play them, see :class:`~sb3_dce.rollouts.Rollouts`
@@ -189,6 +195,8 @@ def make_rollouts(dataset_id: str, n_episodes: int, n_envs: int | None = None) -
 
 def rollouts_of(dataset: str | None, n_episodes: int, n_envs: int | None = None) -> Rollouts | None:
     """
+    Environments of the data a model was trained on: by the catalogue, else by what the data say of themselves.
+
     :param dataset: id, file or ``minari:`` name a model was trained on
     :param n_episodes: episodes of an evaluation
     :param n_envs: environments that play them, see :class:`~sb3_dce.rollouts.Rollouts`
@@ -215,9 +223,11 @@ def rollouts_of(dataset: str | None, n_episodes: int, n_envs: int | None = None)
 
 def plain_policy(model: Any) -> BasePolicy | None:
     """
+    The policy that can stand in for its model, because ``model.predict`` adds nothing to it.
+
     :param model: agent of Stable-Baselines3 or of this package, or anything with ``predict``
     :return: its policy, if ``model.predict`` is the policy's ``predict`` of Stable-Baselines3 and nothing else, on the
-        observations of the environment
+        observations of the environment; else ``None``
     """
     if vec_normalize_of(model) is not None:
         return None
@@ -245,6 +255,8 @@ def deterministic_act(model: Any) -> Act:
 
 def policy_act(policy: BasePolicy) -> Act:
     """
+    Let a policy act without noise through its own modules, which are put into evaluation mode.
+
     :param policy: any policy of Stable-Baselines3 with a box of actions
     :return: function of a batch of observations, the bits of ``policy.predict(obs, deterministic=True)``
     """

@@ -13,6 +13,8 @@ from sb3_dce.experiments.grid import Scale, Variant, source_of
 
 def caption(evidence: Evidence, dataset_ids: Iterable[str], variants: Iterable[Variant] | None = None) -> str:
     """
+    Origin of the numbers in a table or figure, for the runs that stand there for these data and agents.
+
     :param evidence: rows
     :param dataset_ids: data shown
     :param variants: agents shown; ``None`` for all
@@ -24,10 +26,12 @@ def caption(evidence: Evidence, dataset_ids: Iterable[str], variants: Iterable[V
 
 def caption_of(evidence: Evidence, rows: pd.DataFrame, variants: list[Variant]) -> str:
     """
+    Origin of the numbers in words: files and hashes, gradient steps, seeds, episodes, code, settings, further runs.
+
     :param evidence: rows of an experiment
     :param rows: of these, of the runs shown
     :param variants: agents shown
-    :return: where the numbers come from
+    :return: one paragraph, "No data." without rows; at smoke scale it begins with a warning
     """
     if rows.empty:
         return "No data."

@@ -123,8 +123,10 @@ class NodeError(SB3DCEError):
 
 def asker_of(spec: RunSpec) -> str:
     """
+    Hash in the name of a run's folder on a node, so that it is only resumed for whoever has begun it.
+
     :param spec: run, with its folder on this machine
-    :return: what tells apart who asks for it: machine, folder, and version of this package
+    :return: 12 hexadecimal digits that tell apart who asks for it: machine, folder, and version of this package
     """
     folder = Path(spec.folder).absolute().as_posix()
     text = f"{platform.node()} {folder} {sb3_dce.__version__} {source_commit()}"
@@ -170,6 +172,8 @@ def _refuse_other_data(dataset: str, sha256: str) -> None:
 
 def send(folder: Path) -> dict[str, bytes]:
     """
+    Files of a run on the node, to be returned in its :class:`Outcome`; subfolders are left out.
+
     :param folder: of a run
     :return: content of its files by name
     """
@@ -178,7 +182,9 @@ def send(folder: Path) -> dict[str, bytes]:
 
 def receive(folder: Path, files: dict[str, bytes]) -> None:
     """
-    :param folder: where a run is to be complete; the files that say so are written last
+    Write what a node has sent, the marks of a complete run last; without files nothing is done.
+
+    :param folder: where a run is to be complete; it is made if it is missing
     :param files: content by name
     """
     if not files:

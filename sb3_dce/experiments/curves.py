@@ -11,6 +11,8 @@ from sb3_dce.experiments.grid import Panel, Variant
 
 def variants_of(evidence: Evidence, panel: Panel) -> tuple[str, ...]:
     """
+    Lines of a panel that draws variants: those it names, or all of the experiment if it names none.
+
     :param evidence: rows
     :param panel: picture
     :return: names of the variants that belong into it
@@ -20,6 +22,8 @@ def variants_of(evidence: Evidence, panel: Panel) -> tuple[str, ...]:
 
 def view_of(evidence: Evidence, panel: Panel) -> Evidence:
     """
+    Rows that a panel is drawn from: of its variants and its reference, at the length that most of these have.
+
     :param evidence: rows
     :param panel: picture
     :return: rows of its variants alone, which may have longer runs than all of the figure; of one length over all its data
@@ -30,6 +34,8 @@ def view_of(evidence: Evidence, panel: Panel) -> Evidence:
 
 def panel_curves(evidence: Evidence, panel: Panel) -> dict[str, tuple[pd.DataFrame, pd.Series | None]]:
     """
+    All lines of a panel: one per dataset, per beta of the probe, or per variant, as the panel says.
+
     :param evidence: rows
     :param panel: picture
     :return: by line its curves (steps by seeds) and, where there is one, what theory expects; lines without data are left out
@@ -58,12 +64,14 @@ def panel_curves(evidence: Evidence, panel: Panel) -> dict[str, tuple[pd.DataFra
 
 def probe_difference(evidence: Evidence, probe: Variant, dataset_id: str, metric: str, beta: int) -> pd.DataFrame:
     """
+    Q that the critics of one beta give the probed actions, less the Q that the metric compares it with.
+
     :param evidence: rows of the probe
     :param probe: its variant
     :param dataset_id: data
     :param metric: "probe_policy" (against the critics with beta 0), "probe_max" or "probe_min" (against the data's actions)
     :param beta: of the critics, one of ``PROBE_BETAS`` or 0
-    :return: difference of Q, steps by seeds
+    :return: difference of Q, reward units, steps by seeds
     """
     assert beta in (0, *PROBE_BETAS)
     if metric == "probe_policy":

@@ -22,10 +22,12 @@ RIVALS = ("BC", "IQL")
 
 def score_of(evidence: Evidence, variant: Variant, dataset_id: str) -> float | None:
     """
+    Mean over seeds of a variant's scores at the end of its runs; one diverged seed makes it count as failed.
+
     :param evidence: rows
     :param variant: column
     :param dataset_id: row
-    :return: mean of the last scores, ``None`` without runs, or if one diverged: the agent has failed then
+    :return: normalised score, ``None`` without runs, or if one diverged
     """
     if evidence.n_diverged(variant, dataset_id):
         return None
@@ -35,6 +37,8 @@ def score_of(evidence: Evidence, variant: Variant, dataset_id: str) -> float | N
 
 def variant_table(evidence: Evidence) -> TextTable:
     """
+    What each single change of DCE's settings does to its score, with a finding for every data set.
+
     :param evidence: of the search for causes
     :return: score of DCE, its rivals and its changed forms on every data set
     """
@@ -61,8 +65,10 @@ def variant_table(evidence: Evidence) -> TextTable:
 
 def diagnostics_table(evidence: Evidence) -> TextTable:
     """
+    Diagnostics beside the course of the score: terminals, survival margin, ``gap_td``, Q, distance of actions, alpha.
+
     :param evidence: of the search for causes
-    :return: what DCE logged on every data set
+    :return: what DCE logged on every data set that it has runs on
     """
     dce = evidence.experiment.variant("DCE")
     rows = []
@@ -94,6 +100,8 @@ def _caption(evidence: Evidence, *agents: Variant) -> str:
 
 def verdict_of(evidence: Evidence, dataset_id: str) -> str:
     """
+    How far DCE is behind the better of BC and IQL, and which changes, diagnostics or longer runs account for it.
+
     :param evidence: of the search for causes
     :param dataset_id: data
     :return: in words, what the rows say about DCE's place
@@ -152,10 +160,12 @@ def _is_same(evidence: Evidence, one: Variant, other: Variant, dataset_id: str) 
 
 def lowest_margin(evidence: Evidence, variant: Variant, dataset_id: str) -> float | None:
     """
+    Smallest ``survival_margin`` (mean reward less ``beta_eff``) logged at any step of any seed.
+
     :param evidence: rows
     :param variant: DCE
     :param dataset_id: data
-    :return: smallest survival margin of the run, reward units per step
+    :return: reward units per step, ``None`` where it was not logged
     """
     curve = evidence.curve(variant, dataset_id, "survival_margin")
     return None if curve.empty else float(np.nanmin(curve.to_numpy()))
@@ -163,10 +173,12 @@ def lowest_margin(evidence: Evidence, variant: Variant, dataset_id: str) -> floa
 
 def halves(evidence: Evidence, variant: Variant, dataset_id: str) -> tuple[float | None, float | None]:
     """
+    Mean scores in the middle and at the end of the runs, by which a finding says rising or falling.
+
     :param evidence: rows
     :param variant: agent
     :param dataset_id: data
-    :return: mean score of the evaluations between 40 and 60 % of the run, and in its last tenth
+    :return: mean score of the evaluations between 40 and 60 % of the run, and in its last tenth; ``None`` without any there
     """
     curve, n_updates = evidence.curve(variant, dataset_id, "score"), evidence.n_updates(dataset_id) or 0
     shares = curve.index / max(1, n_updates)

@@ -120,9 +120,7 @@ class EpisodeRunner:
         self._sigma = spec.noise * half_range if spec.noise else None
 
     def notes(self) -> tuple[str, ...]:
-        """
-        :return: what the user should know about the policy and the environment
-        """
+        """What the user should know: that the policy is slow or draws no noise, that the environment is not D4RL's."""
         notes = [] if self.facts.note is None else [self.facts.note]
         corrected = [s.id for s in all_specs() if s.env_id == self.spec.env and s.family in ("adroit", "kitchen")]
         if corrected:
@@ -134,6 +132,8 @@ class EpisodeRunner:
 
     def run_many(self, first: int, n: int) -> tuple[Arrays, list[int]]:
         """
+        Consecutive episodes, of which up to ``width`` take their steps in turn.
+
         :param first: number of the first episode
         :param n: episodes
         :return: rows of all of them, in order, and the length of each
@@ -231,6 +231,8 @@ class EpisodeRunner:
 
 def concatenate(parts: Sequence[Arrays]) -> Arrays:
     """
+    Put the rows of all parts one after the other, under the keys of the first part.
+
     :param parts: rows with the same keys, at least one
     :return: all rows
     """

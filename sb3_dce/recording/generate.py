@@ -100,16 +100,12 @@ class Recipe:
 
     @property
     def task(self) -> str:
-        """
-        :return: e.g. ``hopper``
-        """
+        """First part of the dataset's id, such as ``hopper``, by which SAC runs and their folders are named."""
         return self.dataset.id.partition("-")[0]
 
     @property
     def kind(self) -> str:
-        """
-        :return: e.g. ``medium-replay``
-        """
+        """The dataset's id without task and ``-sb3``, such as ``medium-replay``; the seeds follow from it."""
         return self.dataset.id.partition("-")[2].removesuffix("-sb3")
 
 
@@ -171,9 +167,7 @@ class _Job:
 
 
 def recipes() -> dict[str, Recipe]:
-    """
-    :return: id to recipe of every dataset that can be generated
-    """
+    """Id to recipe of every dataset that can be generated; those whose files come with the package have none."""
     return {spec.id: _recipe(spec) for spec in all_specs() if spec.generated and not spec.embedded}
 
 

@@ -40,8 +40,11 @@ class Parts:
 
     def add(self, arrays: Arrays, n_episodes: int) -> None:
         """
+        Append the next episodes; what is in memory only is written once it has :data:`FLUSH_ROWS` rows.
+
         :param arrays: rows of the next episodes
         :param n_episodes: how many they are
+        :raises CheckpointError: if they cannot be written
         """
         self._waiting.append(arrays)
         self._waiting_rows += len(arrays["rewards"])
@@ -67,14 +70,18 @@ class Parts:
 
     def rows(self, n_rows: int | None) -> Arrays:
         """
+        The first rows of the recording, from the files and from memory; the last episode may be cut.
+
         :param n_rows: rows wanted, ``None`` for all
-        :return: the first rows
+        :return: so many rows, fewer if there are fewer
         """
         return {key: array[:n_rows] for key, array in concatenate([*self._whole, *self._waiting]).items()}
 
     def first_episodes(self, n_episodes: int) -> Arrays:
         """
-        :param n_episodes: episodes wanted
+        Rows up to the terminal or timeout that ends the last of the first episodes.
+
+        :param n_episodes: episodes wanted, no more than there are
         :return: their rows
         """
         arrays = self.rows(None)

@@ -216,9 +216,11 @@ def describe(name: str, env: str, arrays: Arrays) -> dict[str, Any]:
 
 def score_of(env: str, attrs: Mapping[str, Any]) -> float | None:
     """
+    D4RL's normalised score (100 = expert) of the mean return that the attributes of a recording name.
+
     :param env: id of the environment, or of a dataset recorded in it
     :param attrs: root attributes
-    :return: D4RL's normalised score of the mean return, ``None`` without whole episodes or reference values
+    :return: score, ``None`` without whole episodes or reference values
     """
     spec = dataset_of_env(env)
     return float(normalized_score(spec.id, attrs["return_mean"])) if spec is not None and "return_mean" in attrs else None
@@ -226,8 +228,10 @@ def score_of(env: str, attrs: Mapping[str, Any]) -> float | None:
 
 def whole_returns(arrays: Arrays) -> np.ndarray:
     """
+    Undiscounted return of each episode that has an end; rows after the last terminal or timeout count for none.
+
     :param arrays: rows
-    :return: undiscounted return of each whole episode, float64
+    :return: shape (whole episodes,), reward units, float64
     """
     stops = _stops(arrays)
     sums = np.concatenate([[0.0], np.cumsum(arrays["rewards"], dtype=np.float64)])
@@ -235,9 +239,7 @@ def whole_returns(arrays: Arrays) -> np.ndarray:
 
 
 def versions() -> str:
-    """
-    :return: releases the bits depend on, for people and for comparison
-    """
+    """Releases the recorded bits depend on, as one text for people and for comparison with an interrupted recording."""
     found = [f"sb3_dce {sb3_dce.__version__}", f"python {platform.python_version()}"]
     for package in ("numpy", "gymnasium", "gymnasium-robotics", "mujoco"):
         try:
@@ -248,9 +250,7 @@ def versions() -> str:
 
 
 def cpu_features() -> str:
-    """
-    :return: architecture and vector instructions NumPy uses here; others may change the last bit of the simulation
-    """
+    """Architecture and vector instructions NumPy uses here; others may change the last bit of the simulation."""
     shown: Any = np.show_config(mode="dicts")
     extensions = shown.get("SIMD Extensions", {})
     return " ".join([platform.machine(), *extensions.get("baseline", []), *extensions.get("found", [])])

@@ -141,16 +141,12 @@ class SACRun:
 
     @property
     def steps(self) -> int:
-        """
-        :return: environment steps done
-        """
+        """Environment steps up to the last evaluation, from which an interrupted run goes on."""
         return int(self._state["steps"])
 
     @property
     def evaluations(self) -> list[tuple[int, float, float]]:
-        """
-        :return: steps, mean return and standard deviation of each evaluation
-        """
+        """Steps, mean return and its standard deviation (reward units) of each evaluation so far, in order."""
         return [(int(steps), float(mean), float(std)) for steps, mean, std in self._state["evaluations"]]
 
     def _train_until_next_evaluation(self) -> None:

@@ -65,9 +65,7 @@ class Behaviour:
 
     @property
     def mean_std(self) -> float:
-        """
-        :return: root mean square of :attr:`std`
-        """
+        """Root mean square of :attr:`std` over the action entries, which are scaled to [-1, 1]."""
         return float(np.sqrt(np.mean(self.std**2)))
 
 

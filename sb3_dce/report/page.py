@@ -105,6 +105,8 @@ def write_report(
 
 def build_page(examination: Examination) -> str:
     """
+    Facts, advice, plots and checks of a dataset as one HTML text; the behaviour policy is estimated here.
+
     :param examination: of data that can be used
     :return: the HTML page
     :raises ConfigError: if matplotlib is not installed
