@@ -69,9 +69,7 @@ class RunSpec:
 
     @property
     def name(self) -> str:
-        """
-        :return: short name for displays
-        """
+        """The label, or agent and seed where there is none: the short name of the run in displays and messages."""
         return self.label or f"{self.algo} seed {self.seed}"
 
 
@@ -118,8 +116,10 @@ def write_config(
 
 def plain(value: Any) -> Any:
     """
+    A setting in types that YAML gives back as they were, so that it can be compared with one in a ``config.yml``.
+
     :param value: of a hyperparameter
-    :return: the same as YAML keeps it; what it does not know becomes a text
+    :return: numbers of NumPy as those of Python, tuples as lists; what YAML does not know becomes a text (its ``repr``)
     """
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
@@ -132,6 +132,8 @@ def plain(value: Any) -> Any:
 
 def read_config(folder: Path) -> dict[str, Any] | None:
     """
+    What :func:`write_config` has recorded of a run: its settings, data, hyperparameters, versions and machine.
+
     :param folder: folder of a run
     :return: its ``config.yml``, ``None`` if it has not begun
     :raises CheckpointError: if the file is damaged, or another program's
@@ -145,6 +147,8 @@ def read_config(folder: Path) -> dict[str, Any] | None:
 
 def spec_from(settings: dict[str, Any], folder: Path) -> RunSpec:
     """
+    Rebuild the specification of a run from its recorded settings; label and device are not recorded and take defaults.
+
     :param settings: of a run, as its files have them
     :param folder: where they are
     :return: the run
@@ -202,8 +206,10 @@ def write_result(spec: RunSpec, folder: Path, evaluations: list[Evaluation], sec
 
 def read_result(folder: Path) -> dict[str, Any] | None:
     """
+    Outcome of a complete run, perhaps one of fewer updates than are asked for now.
+
     :param folder: folder of a run
-    :return: its result, ``None`` if it is not complete
+    :return: its ``result.json``, ``None`` if it is not complete
     :raises CheckpointError: if the file is damaged
     """
     keys = ("config", "n_updates", "seconds", "mean_return", "normalized_score")
@@ -223,8 +229,10 @@ def write_divergence(folder: Path, n_updates: int, reason: str) -> None:
 
 def progress_logs(folder: Path) -> list[tuple[int, Path]]:
     """
+    Logs of a run in the order of training; a run that goes on opens another one.
+
     :param folder: of a run
-    :return: the update after which each log begins, and its file, in this order; those without a line are left out
+    :return: the update after which each begins, and its file; those without a line are left out
     """
     logs = [(int(path.stem.rpartition("_")[2]), path) for path in folder.glob("progress_*.csv") if path.stat().st_size]
     return sorted(logs)
@@ -232,8 +240,10 @@ def progress_logs(folder: Path) -> list[tuple[int, Path]]:
 
 def last_metrics(folder: Path) -> dict[str, float]:
     """
+    Diagnostics in the last row of the newest log that has a row.
+
     :param folder: of a run
-    :return: the diagnostics it logged last, by name without ``train/``; empty if there are none
+    :return: values by name without ``train/``; empty if there are none
     """
     for _, path in reversed(progress_logs(folder)):
         with path.open(newline="", encoding="utf-8") as file:
@@ -246,6 +256,8 @@ def last_metrics(folder: Path) -> dict[str, float]:
 
 def read_divergence(folder: Path) -> dict[str, Any] | None:
     """
+    Where and why a run diverged; one that did has ended and is not trained again.
+
     :param folder: folder of a run
     :return: what :func:`write_divergence` wrote, ``None`` if the run has not diverged
     :raises CheckpointError: if the file is damaged
@@ -256,7 +268,9 @@ def read_divergence(folder: Path) -> dict[str, Any] | None:
 @lru_cache(maxsize=1)
 def source_commit() -> str | None:
     """
-    :return: commit of the checkout this package is used from, ``None`` for an installed one
+    Commit of the checkout this package is used from, asked of git once per process.
+
+    :return: 10 hexadecimal digits or more; ``None`` for an installed package, and without git
     """
     root = Path(sb3_dce.__file__).parent.parent
     if not (root / ".git").exists() or shutil.which("git") is None:
@@ -268,18 +282,22 @@ def source_commit() -> str | None:
 
 def settings_of_run(spec: RunSpec) -> dict[str, Any]:
     """
+    Settings that make a run this one and no other: neither its folder and label nor where it is run.
+
     :param spec: what is run
-    :return: what makes it this run and no other: neither its folder nor how and where it is run
+    :return: value by field of :class:`RunSpec`, without ``folder``, ``label`` and ``device``
     """
     return {key: value for key, value in asdict(spec).items() if key not in ("folder", "label", "device")}
 
 
 def make_logger(spec: RunSpec, model: OfflineAlgorithm, folder: Path) -> Logger:
     """
+    Begin ``progress_<n>.csv`` at the model's update n; logs of other beginnings stay as they are.
+
     :param spec: what is run
     :param model: its model, at the update from which it goes on
     :param folder: where it is written
-    :return: logger to a file of this beginning and, if the model asks for it, to TensorBoard
+    :return: logger to that file and, if the model asks for it, to TensorBoard
     """
     formats = [make_output_format("csv", str(folder), f"_{model.num_timesteps}")]
     if model.tensorboard_log is not None:
@@ -303,8 +321,10 @@ def forget_logs_after(folder: Path, n_updates: int) -> None:
 
 def seconds_before(folder: Path) -> float:
     """
+    Sum of the elapsed times at the ends of all logs there are, to which a run that goes on adds its own.
+
     :param folder: of a run that goes on
-    :return: seconds of training before, from its logs
+    :return: seconds of training before
     """
     total = 0.0
     for _, path in progress_logs(folder):

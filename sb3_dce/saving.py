@@ -201,6 +201,8 @@ class SavingMixin(OffPolicyAlgorithm):
 
     def get_parameters(self) -> dict[str, dict]:
         """
+        State dicts of the policy and of every optimizer, as :meth:`set_parameters` takes them.
+
         :return: state dicts by name; the tensors are copies, independent of further training
         """
         return {name: _cloned(recursive_getattr(self, name).state_dict()) for name in self._get_torch_save_params()[0]}
@@ -208,6 +210,8 @@ class SavingMixin(OffPolicyAlgorithm):
 
 def existing_zip(path: Path) -> Path:
     """
+    The saved model that a path stands for: the file of just this name, else the one with ``.zip`` after it.
+
     :param path: as given by the user, with or without ".zip"
     :return: the file that is there
     :raises CheckpointError: if none is
@@ -233,8 +237,10 @@ def saved_algo(path: Path | io.BufferedIOBase) -> str | None:
 
 def saved_timesteps(path: Path) -> int:
     """
+    How long a saved model had been trained; nothing in the file is unpickled, and no model is made.
+
     :param path: zip file of a model
-    :return: gradient steps it had been trained for; nothing in it is unpickled
+    :return: gradient steps; 0 if the file does not say
     :raises CheckpointError: if it is no saved model
     """
     steps = _saved_data(path).get("num_timesteps")

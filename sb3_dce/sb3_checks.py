@@ -25,8 +25,9 @@ AGENTS_CHOICE = frozenset({"use_v", "use_target_v"})
 
 def check_flags(owner: object) -> None:
     """
-    :param owner: object with a constructor; each parameter that is declared ``bool`` must be one, since a text such as
-        "no" would count as true
+    Refuse a switch that is no bool, since a text such as "no" would count as true.
+
+    :param owner: object with a constructor, of which each parameter that is declared ``bool`` must be one
     :raises ConfigError: if one is not
     """
     for name, parameter in constructor_parameters(type(owner)).items():
@@ -37,6 +38,8 @@ def check_flags(owner: object) -> None:
 
 def check_device(device: Any) -> None:
     """
+    Refuse a device that PyTorch does not know, and CUDA where it finds none, before anything is built on it.
+
     :param device: as PyTorch names it, or "auto"
     :raises ConfigError: if it is something else, or a CUDA device where there is none
     """
@@ -53,10 +56,12 @@ def check_device(device: Any) -> None:
 
 def check_logging(verbose: Any, stats_window_size: Any, tensorboard_log: Any) -> None:
     """
+    Refuse arguments of the logging that are out of range, and a TensorBoard folder where TensorBoard is not installed.
+
     :param verbose: 0, 1 or 2
     :param stats_window_size: episodes, at least 1
     :param tensorboard_log: folder or ``None``
-    :raises ConfigError: if one is something else
+    :raises ConfigError: if one is something else, or TensorBoard is missing
     """
     check_choice("verbose", verbose, (0, 1, 2))
     check_number("stats_window_size", stats_window_size, 1, integer=True)
@@ -70,6 +75,8 @@ def check_logging(verbose: Any, stats_window_size: Any, tensorboard_log: Any) ->
 
 def named_env(env: GymEnv | str, verbose: int) -> GymEnv:
     """
+    Make the environment where only its id is given; any other one is passed through.
+
     :param env: environment, or id of one
     :param verbose: 1 lets Stable-Baselines3 say what it makes
     :return: the environment
@@ -84,6 +91,8 @@ def named_env(env: GymEnv | str, verbose: int) -> GymEnv:
 
 def check_one_env(env: VecEnv) -> None:
     """
+    Refuse a vector of several environments: a model holds a single one.
+
     :param env: environments
     :raises ConfigError: if there is more than one
     """
@@ -94,19 +103,24 @@ def check_one_env(env: VecEnv) -> None:
 
 def python_number(value: Any) -> Any:
     """
-    :param value: number, perhaps one of NumPy's, which Stable-Baselines3 does not take, or a schedule
-    :return: the same, as a number of Python
+    Turn a number of NumPy, which Stable-Baselines3 does not take for a learning rate, into one of Python.
+
+    :param value: number, perhaps one of NumPy's, or a schedule
+    :return: a ``float`` for a number of NumPy, all else as it is
     """
     return float(value) if isinstance(value, np.number) else value
 
 
 def policy_arguments(given: Any, policy_class: type, settings: dict[str, Any]) -> dict[str, Any]:
     """
+    Join the user's ``policy_kwargs`` with what the agent decides, and refuse what contradicts it or would fail later.
+
     :param given: the user's ``policy_kwargs``
     :param policy_class: policy they are for
     :param settings: arguments of the policy that the agent's own parameters decide
     :return: arguments of the policy
-    :raises ConfigError: for something that is no dictionary, an unknown name, or one that the agent decides
+    :raises ConfigError: for something that is no dictionary, an unknown name, one that the agent decides, a wrong value, or a
+        policy that does not take what the agent decides
     """
     if not isinstance(given, dict):
         hint = "For example {'net_arch': [256, 256]}."
@@ -166,9 +180,11 @@ def _extends(value: Any, base: type) -> bool:
 
 def check_spaces(observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
     """
+    Refuse environments that the agents cannot learn for: both spaces must be a ``Box``, that of the actions a bounded one.
+
     :param observation_space: of an environment
     :param action_space: of an environment
-    :raises ConfigError: if observations are no arrays of numbers, or actions have no finite bounds
+    :raises ConfigError: if observations are no arrays of numbers, or actions are discrete or have no finite bounds
     """
     if not isinstance(observation_space, spaces.Box):
         raise ConfigError(
@@ -207,6 +223,8 @@ def check_env_fits(model: Any, env: Any, hint: str) -> None:
 
 def callback_frequencies(callback: BaseCallback) -> list[tuple[str, int]]:
     """
+    After how many steps callbacks act, nested ones included; none may act in the middle of a chunk of updates.
+
     :param callback: callback, or a list or chain of them
     :return: name and value of every frequency in it, in timesteps
     """

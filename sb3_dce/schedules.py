@@ -47,8 +47,10 @@ class StepSchedule:
     @classmethod
     def of(cls, settings: Mapping[str, Any]) -> StepSchedule:
         """
+        Schedule of beta, which changes every ``beta_update_every`` epochs of ``steps_per_epoch`` updates.
+
         :param settings: arguments of :class:`~sb3_dce.OfflineDCE`, or a complete row of its hyperparameters
-        :return: schedule of beta
+        :return: the schedule
         :raises ConfigError: if they contradict each other
         """
         every = settings["beta_update_every"] * settings["steps_per_epoch"]
@@ -56,13 +58,13 @@ class StepSchedule:
 
     @property
     def largest(self) -> float:
-        """
-        :return: largest value it ever has
-        """
+        """Largest value the schedule ever has: ``initial``, unless it rises, and then ``final``."""
         return self.initial if self.final is None or self.rate == 0 else max(self.initial, self.final)
 
     def value(self, n_updates: int) -> float:
         """
+        ``initial - rate * floor(n_updates / every)``, which stops at ``final``.
+
         :param n_updates: completed updates before the step
         :return: value in force during the next update
         """
@@ -73,8 +75,10 @@ class StepSchedule:
 
     def changes(self, n_updates: int) -> list[tuple[int, float]]:
         """
+        The steps whose sum is the value; the first of them, at 0, is ``initial``.
+
         :param n_updates: completed updates
-        :return: completed updates at which the value changed, from 0 on, and by how much
+        :return: completed updates at which the value changed, below ``n_updates``, and by how much
         """
         found = [(0, self.initial)] if n_updates > 0 else []
         for at in range(self.every, n_updates, self.every):

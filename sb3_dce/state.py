@@ -50,6 +50,8 @@ class PureNet:
 
     def __call__(self, flat: th.Tensor, *args: Any) -> Any:
         """
+        Call the network with these parameters instead of its own, which it has again afterwards.
+
         :param flat: shape (n_parameters,)
         :param args: inputs of the network
         :return: its outputs
@@ -91,8 +93,10 @@ class Storage:
     @classmethod
     def of(cls, module: nn.Module) -> Storage:
         """
+        Storage of all parameters of a network, in the order of ``module.parameters()``.
+
         :param module: network; its ``optimizer`` attribute, if it has one, is taken over
-        :return: storage of all its parameters
+        :return: the storage, of which the module's tensors are views from now on
         """
         optimizer = getattr(module, "optimizer", None)
         assert optimizer is None or isinstance(optimizer, th.optim.Optimizer)
@@ -128,9 +132,11 @@ class Storage:
 
     def is_bound(self) -> bool:
         """
-        :return: whether the parameters and moments are still views of this storage; ``load_state_dict`` of an optimizer,
-            ``module.to(...)`` and Stable-Baselines3's ``load`` put other tensors in their place; and whether the same ones are
-            frozen (``requires_grad``)
+        Whether what an update writes here still reaches the module and its optimizer.
+
+        :return: False once parameters or moments are no views of this storage any more (``load_state_dict`` of an optimizer,
+            ``module.to(...)`` and Stable-Baselines3's ``load`` put other tensors in their place), or once other parameters
+            of a trained network are frozen (``requires_grad``) than at the start
         """
         # asked before every update of ``learn``, so by addresses that are known instead of by views made anew
         if any(p.data_ptr() != address for p, address in zip(self._parameters, self._pointers, strict=True)):
@@ -147,6 +153,8 @@ class Storage:
 
     def move_settings(self, device: th.device) -> None:
         """
+        Move the mask of the trained parameters, which only a partly frozen network has, to where the update needs it.
+
         :param device: where the update runs, if it is not where the parameters lie
         """
         if self.settings is not None and self.settings.trained is not None:
@@ -154,13 +162,17 @@ class Storage:
 
     def set_learning_rate(self, learning_rate: float) -> None:
         """
-        :param learning_rate: value kept in the optimizer, as Stable-Baselines3 does; the update gets it as a tensor
+        Keep the rate in the optimizer, as Stable-Baselines3 does, for what is saved and shown; the update does not read it.
+
+        :param learning_rate: value that the update gets as a tensor; a storage without an optimizer ignores it
         """
         if self._optimizer is not None:
             update_learning_rate(self._optimizer, learning_rate)
 
     def read(self) -> Learner | th.Tensor:
         """
+        The stored vectors as the update takes them: the storage's own, not copies.
+
         :return: a learner, or the bare flat vector of a target network
         """
         if self._optimizer is None:
@@ -187,6 +199,8 @@ def _flatten(tensors: list[th.Tensor]) -> th.Tensor:
 
 class LearnedNumber(NamedTuple):
     """
+    A single number trained beside the networks, with an optimizer of its own, such as the log of the entropy coefficient.
+
     :param optimizer: attribute of its optimizer
     :param start: first value, shape (1,); ``None`` if the parameters say that it is not learned
     :param learning_rate: of the optimizer, at the start
@@ -208,13 +222,9 @@ class TrainState:
         self.storages = storages
 
     def is_bound(self) -> bool:
-        """
-        :return: whether every storage is still the one behind the modules
-        """
+        """Whether every storage is still the one behind the modules; if not, a new state has to be made of them."""
         return all(storage.is_bound() for storage in self.storages.values())
 
     def read(self) -> dict[str, Any]:
-        """
-        :return: name -> learner or flat vector
-        """
+        """The tree that the update takes: by name a learner, or the flat vector of what has no optimizer."""
         return {name: storage.read() for name, storage in self.storages.items()}

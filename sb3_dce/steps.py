@@ -43,6 +43,8 @@ class Forward(NamedTuple):
     @classmethod
     def of(cls, function: Callable[[th.Tensor], tuple[th.Tensor, ...]], params: th.Tensor) -> Forward:
         """
+        Call a network once, and keep what leads from gradients by its outputs back to one by its parameters.
+
         :param function: maps a flat parameter vector to outputs
         :param params: parameters, flat
         :return: outputs without gradient; ``pullback`` maps gradients of a loss by them to its gradient by ``params``, once
@@ -66,7 +68,7 @@ def descend_from(
     max_grad_norm: float | None = None,
 ) -> tuple[Learner, th.Tensor, Any, th.Tensor]:
     """
-    :func:`descend` for a loss of a network's outputs that are there already.
+    One optimizer step as by :func:`descend`, on a loss of outputs that the network has computed already.
 
     :param forward: outputs at the parameters of ``learner``
     :param loss: maps these outputs to (0-dimensional loss, anything worth keeping)
@@ -139,8 +141,10 @@ def polyak(params: th.Tensor, target_params: th.Tensor, tau: th.Tensor) -> th.Te
 
 def q_data_metrics(q_values: th.Tensor) -> dict[str, th.Tensor]:
     """
+    Mean, standard deviation and extremes of Q on a batch, which every agent with critics logs.
+
     :param q_values: Q of all critics on the data, any shape, reward units
-    :return: the diagnostics every agent with critics logs of them
+    :return: ``q_data``, ``q_data_std`` (divisor n - 1; 0 for a single value), ``q_data_min`` and ``q_data_max``
     """
     names = ("q_data", "q_data_std", "q_data_min", "q_data_max")
     # a single value has no sample deviation, and a NaN would be taken for a divergence
@@ -150,9 +154,11 @@ def q_data_metrics(q_values: th.Tensor) -> dict[str, th.Tensor]:
 
 def action_metrics(actions: th.Tensor, data_actions: th.Tensor) -> dict[str, th.Tensor]:
     """
+    How far the policy's actions are from the data's, and the share of the policy's that lie at their bounds.
+
     :param actions: of the policy, scaled to [-1, 1], shape (batch, action_dim)
     :param data_actions: of the data in the same states, same shape
-    :return: how far they are apart, and the share of the policy's that lie at their bounds
+    :return: ``action_dist``, the mean absolute difference, and ``action_sat``, the share beyond 0.99; both over components
     """
     saturated = (actions.abs() > 0.99).to(actions.dtype)
     return {"action_dist": (actions - data_actions).abs().mean(), "action_sat": saturated.mean()}

@@ -14,6 +14,8 @@ _POINTS = 20_001
 @lru_cache(maxsize=1024)
 def student_quantile(freedom: float, level: float = 0.95) -> float:
     """
+    Quantile of Student's t for a two-sided interval, by integration of the density.
+
     :param freedom: degrees of freedom, from 1 up; Welch's need not be whole
     :param level: probability inside of a two-sided interval
     :return: how many standard errors the interval reaches to each side
@@ -59,8 +61,10 @@ def welch_freedom(errors: Sequence[float], freedoms: Sequence[float]) -> float:
 
 def sample_std(values: np.ndarray) -> np.ndarray:
     """
+    Standard deviation over seeds with divisor n - 1.
+
     :param values: one number per seed along the first axis
-    :return: standard deviation over them with divisor n - 1; NaN for one seed
+    :return: shape of ``values`` without the first axis; NaN for one seed
     """
     return np.std(values, axis=0, ddof=1) if len(values) > 1 else np.full(np.shape(values)[1:], np.nan)
 

@@ -50,7 +50,9 @@ def shift_factor(n_updates: int, gamma: float, tau: float) -> float:
 
 def value_shift_factor(n_updates: int, gamma: float, tau: float) -> float:
     """
-    :func:`shift_factor` for V: since ``q = gamma v - 1``, V falls by what Q falls beyond its own penalty, over gamma.
+    Expected lowering of V on the data after some gradient steps, the counterpart of :func:`shift_factor`.
+
+    Since ``q = gamma v - 1``, V falls by what Q falls beyond its own penalty, over gamma.
 
     :param n_updates: gradient steps k, at least 1
     :param gamma: discount factor in (0, 1)

@@ -97,6 +97,8 @@ def train_seeds(
 
 def show_results(algo: str, results: list[dict[str, Any]], console: Console) -> None:
     """
+    Print a line per seed: return and normalised score of the last evaluation, and how long the run took.
+
     :param algo: name of the agent
     :param results: of its seeds
     :param console: where to print
@@ -119,12 +121,14 @@ def show_results(algo: str, results: list[dict[str, Any]], console: Console) -> 
 
 def evaluate_file(model_path: Path, dataset: str | None, n_episodes: int, seed: int, env: str | None = None) -> Evaluation:
     """
+    Play episodes with a saved agent, by default in the environment of the data that it was trained on.
+
     :param model_path: zip file of an agent
     :param dataset: id that names environment and score; ``None`` takes the model's own
     :param n_episodes: episodes
     :param seed: seed of the first episode
     :param env: id of an environment instead of that of a dataset; there is no score then
-    :return: outcome
+    :return: returns and lengths, and the score where there is one
     :raises CheckpointError: if the file is not a model of this package
     :raises ConfigError: if no environment is known or installed
     """

@@ -66,9 +66,11 @@ class SpectralLinear(nn.Module):
 
     def normalized(self, left: th.Tensor, right: th.Tensor) -> th.Tensor:
         """
+        Weights divided by their largest singular value, for which ``left^T W right`` stands; gradients flow through it.
+
         :param left: shape (n_critics, n_out)
         :param right: shape (n_critics, n_in)
-        :return: weights by their largest singular value ``left^T W right``, shape (n_critics, n_out, n_in)
+        :return: shape (n_critics, n_out, n_in)
         """
         sigma = (left * th.matmul(self.weight, right.unsqueeze(-1)).squeeze(-1)).sum(dim=-1)
         return self.weight / sigma[..., None, None]
@@ -126,9 +128,7 @@ class DropoutCritic(KeepDtype, BaseModel):
     # -- vectors of the power iteration and masks ------------------------------------------------------------------
 
     def power_vectors(self) -> list[th.Tensor]:
-        """
-        :return: left and right vectors of each layer, the buffers themselves
-        """
+        """Left and right vectors of each layer in turn, the buffers themselves, for the storage that updates them."""
         return [vector for layer in self.layers for vector in (layer.left, layer.right)]
 
     def power_step(self, vectors: th.Tensor) -> th.Tensor:
@@ -150,8 +150,10 @@ class DropoutCritic(KeepDtype, BaseModel):
 
     def mask_specs(self, *leading: int) -> list[NoiseSpec]:
         """
+        Dropout masks to be drawn before an update, one per hidden layer.
+
         :param leading: dimensions before the unit's
-        :return: dropout masks, one of shape (*leading, width) per hidden layer
+        :return: specifications of the shapes (*leading, width)
         """
         return [NoiseSpec("dropout", (*leading, width), self.dropout) for width in self.net_arch]
 
@@ -298,6 +300,8 @@ class DropoutCritic(KeepDtype, BaseModel):
 
 def most_dropped(width: int, dropout: float) -> int:
     """
+    How many units of a layer a mask can be taken to drop at most, which is what a thinned product counts out.
+
     :param width: units of a layer
     :param dropout: probability that a unit is dropped
     :return: smallest number that a mask exceeds with a probability below :data:`RARE`, at least 1
@@ -352,10 +356,12 @@ class ActionVAE(KeepDtype, BaseModel):
 
     def forward(self, obs: th.Tensor, actions: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """
+        Encode the data's actions, draw latent variables, and decode these: what the autoencoder's loss is made of.
+
         :param obs: shape (batch, *obs_shape)
         :param actions: scaled to [-1, 1], shape (batch, action_dim)
         :param noise: standard normal, shape (batch, latent_dim)
-        :return: reconstructed actions, mean and log standard deviation of the latent variables
+        :return: reconstructed actions (after tanh), mean and log standard deviation of the latent variables
         """
         hidden = self.encoder(th.cat([self.extract_features(obs, self.features_extractor), actions], dim=-1))
         mean, log_std = self.mean(hidden), self.log_std(hidden).clamp(*VAE_LOG_STD_LIMITS)
@@ -363,6 +369,8 @@ class ActionVAE(KeepDtype, BaseModel):
 
     def decode(self, obs: th.Tensor, latents: th.Tensor) -> th.Tensor:
         """
+        Actions that latent variables stand for in given states, of which each may have several.
+
         :param obs: shape (batch, *obs_shape)
         :param latents: shape (..., batch, latent_dim)
         :return: actions before tanh, shape (..., batch, action_dim)

@@ -73,7 +73,9 @@ class UWACPolicy(OfflineSACPolicy):
 
     def set_training_mode(self, mode: bool) -> None:
         """
-        :param mode: True for training, False for evaluation; the targets always stay in evaluation mode
+        Switch actor, critics and action model; the targets always stay in evaluation mode.
+
+        :param mode: True for training, False for evaluation
         """
         super().set_training_mode(mode)
         self.vae.set_training_mode(mode)

@@ -20,6 +20,8 @@ class ActorWarmUp(OfflineAlgorithm):
 
     def check_parameters(self) -> None:
         """
+        Refuse a first phase of negative or fractional length and an unknown ``actor_q_timing``, besides what the base refuses.
+
         :raises ConfigError: if a parameter is out of its range
         """
         super().check_parameters()
@@ -28,8 +30,10 @@ class ActorWarmUp(OfflineAlgorithm):
 
     def in_warm_up(self, n_updates: int) -> bool:
         """
+        Whether the actor ignores the critics in the next update, as in the first ``policy_eval_start`` ones.
+
         :param n_updates: completed updates
-        :return: whether the next one still belongs to the first phase
+        :return: True in the first phase
         """
         return n_updates < self.policy_eval_start
 

@@ -78,10 +78,12 @@ class Evidence:
 
     def among(self, names: Iterable[str], n_updates: int | None = None) -> Evidence:
         """
+        Evidence on some of the variants, whose own usual length counts instead of that of the whole experiment.
+
         :param names: of variants
-        :param n_updates: only runs of this length; ``None`` for the one that most of these variants have
-        :return: the same rows for these variants alone, of the same files: those of a figure's panel may have longer runs than
-            all of the figure
+        :param n_updates: only runs of this length, unless this evidence has one already; ``None`` for the one that most of
+            these variants have
+        :return: the same rows, of the same files: those of a figure's panel may have longer runs than all of the figure
         """
         wanted = set(names)
         variants = tuple(v for v in self.experiment.variants if v.name in wanted)
@@ -94,9 +96,11 @@ class Evidence:
 
     def of_one_length(self, names: Iterable[str], papers: Iterable[str | None] = (None,)) -> Evidence:
         """
+        As :meth:`among`, with one length for several data sets: numbers of different lengths are not compared.
+
         :param names: of variants
         :param papers: D4RL ids; ``None`` for the grid's first
-        :return: as :meth:`among`, of the length that most of these variants have over all these data, the longest of several
+        :return: the variants at the length that most of them have over all these data, the longest of several
         """
         names = list(names)
         view = self.among(names)
@@ -108,9 +112,7 @@ class Evidence:
 
     @property
     def left_out(self) -> int:
-        """
-        :return: runs on another version of a file than the one that is taken
-        """
+        """Number of runs of the variants that do not count, since they are on another version of a file than is taken."""
         names = [EMBEDDED] if self.scale.source == "embedded" else [name for d in self.experiment.datasets for name in d.ids]
         own = {name: self.every_run(name, self.experiment.variants)["dataset_sha256"] for name in names}
         return sum(int((hashes != self._file(name)).sum()) for name, hashes in own.items() if len(hashes))
@@ -123,8 +125,10 @@ class Evidence:
 
     def ids(self, dataset: GridDataset) -> list[str]:
         """
+        Ids under which a dataset of the grid has results: D4RL's and our twin's are two rows of a table, never one.
+
         :param dataset: of the grid
-        :return: ids under which there are rows: D4RL's and our twin's are two rows of a table, never one
+        :return: the paper's first; at smoke scale the embedded data's for the first dataset, none for the others
         """
         names = [EMBEDDED] if self.scale.source == "embedded" and dataset == self.experiment.datasets[0] else list(dataset.ids)
         if self.scale.source == "embedded" and names != [EMBEDDED]:
@@ -133,8 +137,10 @@ class Evidence:
 
     def paper_id(self, dataset: GridDataset) -> str:
         """
+        D4RL set whose printed numbers stand beside ours, also where our runs are on the twin.
+
         :param dataset: of the grid
-        :return: the paper's set whose numbers stand beside; at smoke scale that of the embedded data
+        :return: the paper's id; at smoke scale that of the set for which the embedded data stand
         """
         if self.scale.source != "embedded":
             return dataset.paper
@@ -142,21 +148,27 @@ class Evidence:
 
     def table_rows(self) -> list[tuple[GridDataset, str]]:
         """
-        :return: dataset of the grid and id of the data, for every row that has results
+        Rows of a table that have results, in the order of the grid, D4RL's file before our twin.
+
+        :return: dataset of the grid and id of the data of each
         """
         return [(dataset, name) for dataset in self.experiment.datasets for name in self.ids(dataset)]
 
     def variants(self, dataset: GridDataset) -> list[Variant]:
         """
+        Variants that the grid runs on a dataset: all but those that are meant for other sets of the paper.
+
         :param dataset: of the grid
-        :return: those that are run on it
+        :return: in the order of the columns
         """
         return [v for v in self.experiment.variants if v.datasets is None or dataset.paper in v.datasets]
 
     def id_of(self, paper: str | None) -> str | None:
         """
+        Id of the data on which a panel or a claim about a set of the paper is shown, where several may stand for it.
+
         :param paper: D4RL id; ``None`` for the grid's first
-        :return: id that stands for it, the one with results of more variants, else D4RL's own; ``None`` if there is none
+        :return: the one with results of more variants, of equals D4RL's own; ``None`` if there is none
         """
         dataset = self.entry(paper)
         ids = self.ids(dataset)
@@ -164,13 +176,17 @@ class Evidence:
 
     def entry(self, paper: str | None) -> GridDataset:
         """
+        Dataset of the grid that a panel or a claim is about; those that name none are about the first.
+
         :param paper: D4RL id; ``None`` for the grid's first
-        :return: its entry in the grid
+        :return: the entry, with its twin and notes
         """
         return self.experiment.datasets[0] if paper is None else self.experiment.dataset(paper)
 
     def other_kind(self, paper: str | None) -> str:
         """
+        Note on data of another kind than the paper's set, on which its claims cannot be tested.
+
         :param paper: D4RL id; ``None`` for the grid's first
         :return: how the data that stand for it differ in kind from it; empty if they do not
         """
@@ -179,9 +195,11 @@ class Evidence:
 
     def scope(self, dataset_id: str, variants: Iterable[Variant]) -> str:
         """
+        Text behind the numbers of a statement: data, length and seeds that it rests on, and which runs are lost.
+
         :param dataset_id: data
-        :param variants: agents
-        :return: data, length and seeds that a statement about them rests on, and which runs are lost
+        :param variants: agents; those without runs there do not count
+        :return: such as "hopper-medium-sb3, 50,000 steps, 1 to 3 seeds; CQL: 1 diverged"
         """
         shown = [v for v in variants if len(self.rows_of(v, dataset_id))]
         seeds = sorted({self.rows_of(v, dataset_id)["seed"].nunique() for v in shown}) or [0]
@@ -227,8 +245,10 @@ class Evidence:
 
     def n_updates(self, dataset_id: str) -> int | None:
         """
+        Length of the runs that count on these data: that asked for, else that of most agents, the longest of several.
+
         :param dataset_id: data
-        :return: length of its runs, gradient steps
+        :return: gradient steps; ``None`` without runs of it
         """
         if dataset_id not in self._length_of:
             runs = runs_in(self._of_any_length(dataset_id))
@@ -266,19 +286,22 @@ class Evidence:
 
     def key_of(self, variant: Variant, dataset_id: str) -> str:
         """
+        Text by which two variants are found to be one agent, as two schedules of beta that have not parted yet.
+
         :param variant: of the experiment
         :param dataset_id: data
-        :return: the same text for variants that are one agent over the length of the runs there
+        :return: the same for variants that are one agent over the length of the runs there (over one step without any)
         """
         settings = settings_in_force(variant, dataset_id, self.scale)
         return agent_key(variant.algo, settings, self.n_updates(dataset_id) or 1)
 
     def rows_of_any_length(self, variant: Variant, dataset_id: str) -> pd.DataFrame:
         """
+        Rows of a variant's runs on the file that is taken, also those of another that is the same agent over their length.
+
         :param variant: of the experiment
         :param dataset_id: data
-        :return: rows of its runs, also those of another variant that is the same agent over their length; only those of the
-            length that the caller named, if one is
+        :return: rows of runs of all lengths; only those of the length that the caller named, if one is
         """
         key = (variant.name, dataset_id)
         if key not in self._of_variant:
@@ -290,9 +313,11 @@ class Evidence:
 
     def rows_of(self, variant: Variant, dataset_id: str) -> pd.DataFrame:
         """
+        Rows of the runs of a variant that count: those of the length that is compared on these data, see :meth:`n_updates`.
+
         :param variant: of the experiment
         :param dataset_id: data
-        :return: as :meth:`rows_of_any_length`, those of the length that most variants have there
+        :return: as :meth:`rows_of_any_length`, of this length; empty if the variant has only others
         """
         key = (variant.name, dataset_id)
         if key not in self._runs:
@@ -302,18 +327,23 @@ class Evidence:
 
     def of_other_length(self, variant: Variant, dataset_id: str) -> pd.DataFrame:
         """
+        Rows of a variant that cannot be compared since it has no runs of the common length; tables show them as what they are.
+
         :param variant: of the experiment
         :param dataset_id: data
-        :return: rows of its longest runs, if it has none of the length of the others and the caller named no length
+        :return: rows of its longest runs; empty if it has some of the length of the others, or if the caller named a length
         """
         rows = self.rows_of_any_length(variant, dataset_id)
         return rows.iloc[:0] if len(self.rows_of(variant, dataset_id)) else rows[rows["n_updates"] == rows["n_updates"].max()]
 
     def last_of_longer(self, variant: Variant, dataset_id: str) -> tuple[np.ndarray, int] | None:
         """
+        Scores of runs that are longer than the row's, by which it is seen what more training does.
+
         :param variant: of the experiment
         :param dataset_id: data
-        :return: scores at the end of its longest runs, and their gradient steps, if these are more than the others have
+        :return: scores at the end of its longest runs, one per seed, and their gradient steps; ``None`` without scores, or
+            if these steps are no more than the others have
         """
         rows = self.rows_of_any_length(variant, dataset_id)
         rows = rows[rows["n_updates"] > (self.n_updates(dataset_id) or 0)]
@@ -321,10 +351,12 @@ class Evidence:
 
     def last_of_most_seeds(self, variant: Variant, dataset_id: str) -> tuple[np.ndarray, int] | None:
         """
+        Scores at whichever length has the most seeds, by which it is judged how far seeds spread.
+
         :param variant: of the experiment
         :param dataset_id: data
-        :return: scores at the end of its runs of the length with the most seeds, the longest of several, and their gradient
-            steps; ``None`` without scores
+        :return: scores at the end of these runs, one per seed, of several such lengths the longest, and their gradient steps;
+            ``None`` without scores
         """
         ends = self.rows_of_any_length(variant, dataset_id)
         ends = ends[(ends["metric"] == "score") & (ends["step"] == ends["n_updates"])]
@@ -334,8 +366,10 @@ class Evidence:
 
     def largest_spread(self, dataset_id: str) -> float:
         """
+        Standard deviation that agents with too few seeds for one of their own borrow: the largest of any agent on these data.
+
         :param dataset_id: data
-        :return: largest standard deviation over seeds of an agent's last scores, of any length; 0 without any two seeds
+        :return: of an agent's last scores over seeds, of any length; 0 where no agent has two seeds
         """
         rows = self._of_any_length(dataset_id)
         ends = rows[(rows["metric"] == "score") & (rows["step"] == rows["n_updates"])]
@@ -346,15 +380,19 @@ class Evidence:
 
     def last(self, variant: Variant, dataset_id: str, metric: str = "score") -> np.ndarray:
         """
+        Value of a metric at the end of the runs that count, by default the scores that a table's cell is made of.
+
         :param variant: of the experiment
         :param dataset_id: data
         :param metric: name
-        :return: its value at the end of each complete run, in the order of the seeds
+        :return: one per run that has it there, in the order of the seeds
         """
         return at_end(self.rows_of(variant, dataset_id), metric)
 
     def last_of_other_length(self, variant: Variant, dataset_id: str) -> tuple[np.ndarray, int] | None:
         """
+        Scores that a table shows as "after n", for a variant whose runs are all of another length than the row's.
+
         :param variant: of the experiment
         :param dataset_id: data
         :return: scores at the end of the runs of :meth:`of_other_length`, and their gradient steps; ``None`` without any
@@ -363,10 +401,12 @@ class Evidence:
 
     def start(self, variant: Variant, dataset_id: str, metric: str) -> float | None:
         """
+        A fact about the data that the runs noted at step 0, such as their mean reward or number of terminals.
+
         :param variant: of the experiment
         :param dataset_id: data
-        :param metric: name of a fact about the data
-        :return: its value
+        :param metric: name of the fact, such as ``data_reward_mean``
+        :return: its value; ``None`` if no run has it
         """
         rows = self.rows_of(variant, dataset_id)
         values = rows[(rows["metric"] == metric) & (rows["step"] == 0)]["value"]
@@ -374,23 +414,29 @@ class Evidence:
 
     def n_diverged(self, variant: Variant, dataset_id: str) -> int:
         """
+        Number of runs that diverged among those that count: an agent with one has failed, whatever its other seeds score.
+
         :param variant: of the experiment
         :param dataset_id: data
-        :return: runs that diverged
+        :return: runs; 0 without any
         """
         rows = self.rows_of(variant, dataset_id)
         return int((rows["metric"] == "diverged").sum())
 
     def has_ended(self, variant: Variant, dataset_id: str) -> bool:
         """
+        Whether a variant has a result on these data: a run with a last score, or one that diverged.
+
         :param variant: of the experiment
         :param dataset_id: data
-        :return: whether there are runs with a score, or that diverged; without a simulator a run has neither
+        :return: false without runs, and for runs without a simulator, which have neither
         """
         return len(self.last(variant, dataset_id)) > 0 or self.n_diverged(variant, dataset_id) > 0
 
     def curve(self, variant: Variant, dataset_id: str, metric: str) -> pd.DataFrame:
         """
+        Course of a metric over the runs that count: scores of the evaluations, diagnostics as means over intervals.
+
         :param variant: of the experiment
         :param dataset_id: data
         :param metric: name
@@ -400,19 +446,22 @@ class Evidence:
 
     def tail(self, variant: Variant, dataset_id: str, metric: str) -> float | None:
         """
+        What a metric has become by the end of the runs: its mean over their last tenth, each seed with the same weight.
+
         :param variant: of the experiment
         :param dataset_id: data
         :param metric: name
-        :return: mean over the last tenth of the run and over seeds; ``None`` without values in it, as when all runs diverged
-            before
+        :return: in the metric's units; ``None`` without values in the last tenth, as when all runs diverged before
         """
         return self.tail_mean(self.curve(variant, dataset_id, metric), dataset_id)
 
     def tail_mean(self, curve: pd.DataFrame, dataset_id: str) -> float | None:
         """
+        As :meth:`tail`, of a curve that is no metric of the rows, such as the difference of two critics' Q.
+
         :param curve: one column per seed, indexed by gradient steps
         :param dataset_id: data of its runs
-        :return: as :meth:`tail`
+        :return: mean over the last tenth and over seeds; ``None`` without values in it
         """
         late = curve[curve.index > (1.0 - TAIL) * (self.n_updates(dataset_id) or 0)]
         # each seed counts the same, however often it was evaluated
@@ -447,9 +496,11 @@ class Evidence:
 
     def beta_eff(self, variant: Variant, dataset_id: str) -> float:
         """
+        Shift of Q on the data in one Bellman step, ``beta / (2 c)``, with the settings that a variant has on these data.
+
         :param variant: of DCE with a constant beta
         :param dataset_id: data
-        :return: shift per Bellman step, reward units
+        :return: reward units per step
         """
         settings = settings_in_force(variant, dataset_id, self.scale)
         return beta_eff(settings["beta"], settings["td_loss_coef"])
@@ -458,9 +509,11 @@ class Evidence:
 
     def shown(self, dataset_ids: Iterable[str], variants: Iterable[Variant]) -> pd.DataFrame:
         """
+        Rows that a caption describes: of each variant on each data set the runs that count, else those of another length.
+
         :param dataset_ids: data
         :param variants: agents
-        :return: rows of the runs that stand for them
+        :return: rows; those of runs that stand for two variants may be there twice
         """
         cells = [(v, name) for name in dataset_ids for v in variants]
         parts = [part for cell in cells for part in (self.rows_of(*cell), self.of_other_length(*cell))]
@@ -468,9 +521,11 @@ class Evidence:
 
     def every_run(self, dataset_id: str, variants: Iterable[Variant]) -> pd.DataFrame:
         """
+        Runs of the variants themselves, of any length and on any version of the file, by which is counted what is not shown.
+
         :param dataset_id: data
-        :param variants: agents
-        :return: one line per run of those that the grid has there, of any length and on any version of the file
+        :param variants: agents; those that the grid does not have there do not count
+        :return: one line per run, with the columns ``RUN_KEY``
         """
         parts = self._own(dataset_id, variants)
         return runs_in(pd.concat(parts) if parts else self._rows.iloc[:0])
@@ -478,17 +533,21 @@ class Evidence:
 
 def runs_in(rows: pd.DataFrame) -> pd.DataFrame:
     """
+    Runs that rows belong to, whatever their steps and metrics.
+
     :param rows: any
-    :return: one line per run
+    :return: one line per run, with the columns ``RUN_KEY``
     """
     return rows[RUN_KEY].drop_duplicates()
 
 
 def at_end(rows: pd.DataFrame, metric: str) -> np.ndarray:
     """
+    Value of a metric at the last step of each run; a run that has none there is left out.
+
     :param rows: of runs of one agent
     :param metric: name
-    :return: its value at the end of each run, in the order of the seeds
+    :return: values in the order of the seeds
     """
     rows = rows[(rows["metric"] == metric) & (rows["step"] == rows["n_updates"])]
     return rows.sort_values("seed")["value"].to_numpy(dtype=float)
@@ -496,7 +555,9 @@ def at_end(rows: pd.DataFrame, metric: str) -> np.ndarray:
 
 def curve_of(rows: pd.DataFrame, metric: str) -> pd.DataFrame:
     """
-    :param rows: of runs of one agent
+    Values of a metric as a table of steps by seeds, without step 0, where facts about the data stand.
+
+    :param rows: of runs of one agent and length
     :param metric: name
     :return: one column per seed, indexed by gradient steps
     """
@@ -523,8 +584,10 @@ def _commonest(values: pd.Series) -> str:
 
 def span(numbers: Iterable[int]) -> str:
     """
+    Numbers of seeds, steps or episodes as they stand in a caption: "3", "1 to 5", "-" without any.
+
     :param numbers: in order
-    :return: the only one, or the first and the last
+    :return: the only one, or the first and the last, thousands with commas
     """
     found = [f"{int(n):,}" for n in numbers]
     return found[0] if len(found) == 1 else f"{found[0]} to {found[-1]}" if found else "-"

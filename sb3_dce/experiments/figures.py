@@ -37,6 +37,8 @@ WIDTH, HEIGHT, COLUMNS = 4.6, 4.2, 3
 
 def draw(evidence: Evidence, folder: Path, name: str) -> list[Path]:
     """
+    One picture of all panels of a figure; at smoke scale those of other sets than the grid's first are left out.
+
     :param evidence: of an experiment with panels
     :param folder: where the pictures are written
     :param name: of the files, without ending

@@ -72,22 +72,24 @@ class GridDataset:
 
     @property
     def ids(self) -> tuple[str, ...]:
-        """
-        :return: ids under which results of this row may be found, the paper's first
-        """
+        """Ids under which results of this row may be found, the paper's first, then that of the twin if there is one."""
         return (self.paper,) if self.twin is None else (self.paper, self.twin)
 
     def is_other_kind(self, dataset_id: str | None) -> bool:
         """
+        Whether a claim about the paper's kind of data cannot be tested on these: D4RL's own set is never of another kind.
+
         :param dataset_id: one of :attr:`ids`, ``None`` without results
-        :return: whether these data are of another kind than the paper's
+        :return: true for a twin that the grid says to be of another kind
         """
         return self.other_kind and dataset_id == self.twin
 
     @property
     def absence(self) -> str:
         """
-        :return: what to say where there are no results: without D4RL's file there can be none for Kitchen
+        What tables and panels say where there are no results: "no data" for a set without a twin, else "not run".
+
+        :return: "no data" for Kitchen, since there can be none without D4RL's file
         """
         return "no data" if self.twin is None else "not run"
 
@@ -166,15 +168,21 @@ class Experiment:
 
     def dataset(self, paper: str) -> GridDataset:
         """
+        Entry of the grid for a set of the paper; a twin's id or an alias does not find it.
+
         :param paper: D4RL id
         :return: the entry
+        :raises StopIteration: for an id that the grid does not have
         """
         return next(d for d in self.datasets if d.paper == paper)
 
     def variant(self, name: str) -> Variant:
         """
+        Entry of the grid for a column of the table or a line of the figure.
+
         :param name: heading
         :return: the entry
+        :raises StopIteration: for a heading that the grid does not have
         """
         return next(v for v in self.variants if v.name == name)
 
@@ -201,15 +209,15 @@ class PlannedRun:
 
     @property
     def key(self) -> tuple[str, str, str, int, int]:
-        """
-        :return: dataset, agent, configuration, length and seed, as in the rows
-        """
+        """Dataset, agent, configuration, length and seed, as in the rows: what makes two planned runs the same run."""
         return self.spec.dataset, self.spec.algo, self.config, self.spec.n_updates, self.spec.seed
 
 
 def experiment_ids() -> list[str]:
     """
-    :return: names of all experiments, in the order of the page of results; those it does not name come last
+    Names of all experiments that have a grid, in the order of the page of results.
+
+    :return: names; those that the order does not have come last
     """
     order = ["table1", "table-adroit-kitchen", "run-times", "fig-tau", "fig-beta", "fig-ood", "fig-alpha", "fig-cql-q"]
     order += ["fig-cql-return", "fig-sac", "fig-alpha-return", "bounds", "config-tables", "why-dce-loses"]
@@ -219,8 +227,10 @@ def experiment_ids() -> list[str]:
 
 def load_experiment(experiment_id: str) -> Experiment:
     """
+    Experiment as its grid describes it; a scale has the common values where the grid gives none of its own.
+
     :param experiment_id: name on the command line
-    :return: the experiment
+    :return: the experiment, with all three scales
     :raises ConfigError: for an unknown name
     """
     known = experiment_ids()
@@ -285,16 +295,20 @@ def expand(
 
 def variant_hash(variant: Variant, dataset_id: str, scale: Scale | None = None) -> str:
     """
+    Hash of the settings that a variant has on these data, by which its runs are found among the rows.
+
     :param variant: of a grid
     :param dataset_id: data it is run on
     :param scale: adds its own arguments
-    :return: hash of the run's configuration, as it stands in the rows
+    :return: 12 hexadecimal digits, as in the column ``config_hash``
     """
     return config_hash(variant.algo, settings_in_force(variant, dataset_id, scale))
 
 
 def settings_in_force(variant: Variant, dataset_id: str, scale: Scale | None = None) -> dict[str, Any]:
     """
+    Settings with which a variant's agent is made: defaults, over these the dataset's row, the scale's, and last its own.
+
     :param variant: of a grid
     :param dataset_id: data it is run on
     :param scale: adds its own arguments
@@ -325,6 +339,8 @@ def agent_key(algo: str, settings: Mapping[str, Any], n_updates: int) -> str:
 
 def source_of(dataset_id: str) -> str:
     """
+    Whose data these are: rows of D4RL's and of our own never enter one total.
+
     :param dataset_id: id of the catalogue
     :return: "D4RL" or "sb3" (made with this package)
     """
@@ -393,9 +409,11 @@ def _file_of(dataset: GridDataset, source: str, asked_for: bool) -> str | None:
 
 def present_datasets(experiment: Experiment, scale: Scale) -> list[str]:
     """
+    Datasets of the grid that can be run here without another file, which is what ``--datasets present`` takes.
+
     :param experiment: with its datasets
     :param scale: decides which file is looked for
-    :return: the paper's ids of those whose data are on this machine
+    :return: the paper's ids of those whose data are on this machine, also where a twin stands for them
     """
     found = []
     for dataset in experiment.datasets:

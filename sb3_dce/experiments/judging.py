@@ -38,6 +38,8 @@ WORKING = 5.0
 
 class Verdict(NamedTuple):
     """
+    A claim of the paper with the rule by which it was judged, the outcome, and the numbers that decided.
+
     :param claim: of the paper
     :param rule: when it counts as borne out
     :param outcome: "held", "did not hold", "too close to tell" or "could not be tested"
@@ -54,6 +56,8 @@ class Verdict(NamedTuple):
 
 class Uncertainty(NamedTuple):
     """
+    How far seeds alone can move the mean score of an agent, as Welch's test takes it.
+
     :param error: standard error of a mean over seeds
     :param freedom: degrees of freedom of its estimate
     :param borrowed: whether the deviation is that of other runs, so that it is no second estimate beside theirs
@@ -66,10 +70,12 @@ class Uncertainty(NamedTuple):
 
 def judge(claim: str, rule: str, holds: bool | str | None, numbers: str) -> Verdict:
     """
+    Verdict from the result of a rule: true is "held", false "did not hold", ``None`` "could not be tested".
+
     :param claim: of the paper
     :param rule: applied
     :param holds: outcome, ``CLOSE``, or ``None`` without the runs it needs
-    :param numbers: shown
+    :param numbers: shown; without any an untested claim has "runs are missing"
     :return: verdict
     """
     if isinstance(holds, str):
@@ -96,8 +102,10 @@ class Values(dict[str, float]):
 
     def text(self, digits: int = 1) -> str:
         """
+        Numbers as a verdict shows them, such as "BC: 42.0, DCE: diverged (scope)"; what is not finite has diverged.
+
         :param digits: behind the point
-        :return: names, numbers and scope; empty without numbers
+        :return: names, numbers and, if there is one, the scope in brackets; empty without numbers
         """
         shown = {name: f"{value:.{digits}f}" if math.isfinite(value) else "diverged" for name, value in self.items()}
         numbers = ", ".join(f"{name}: {value}" for name, value in shown.items())
@@ -106,12 +114,14 @@ class Values(dict[str, float]):
 
 def values_of(evidence: Evidence, names: list[str], metric: str, dataset: str | None = None) -> Values | None:
     """
+    Numbers that a claim compares: what each variant has become by the end of its runs, all of one length on the same data.
+
     :param evidence: rows
     :param names: of variants
     :param metric: name
     :param dataset: D4RL id; ``None`` for the grid's first
-    :return: value of each variant at the end of its runs: mean of the last tenth, over seeds; of scores minus infinity if a
-        run diverged, since then the agent has failed; ``None`` if one is missing
+    :return: value of each variant: mean of the last tenth, over seeds; of scores minus infinity if a run diverged, since then
+        the agent has failed; ``None`` if one is missing
     """
     view = evidence.among(names)
     dataset_id = view.id_of(dataset)
@@ -134,10 +144,12 @@ def values_of(evidence: Evidence, names: list[str], metric: str, dataset: str | 
 
 def uncertainty(evidence: Evidence, own: np.ndarray, dataset_id: str) -> Uncertainty:
     """
+    Standard error of an agent's mean score, from its own seeds if it has three or more, else from the largest known deviation.
+
     :param evidence: rows of the experiment
     :param own: last scores of an agent, one per seed
     :param dataset_id: data
-    :return: of their mean. One or two seeds say little on their spread: there it is the largest that is known, see ``CLEARLY``
+    :return: of their mean; one or two seeds say little on their spread, what is taken for it is said in ``CLEARLY``
     """
     n = max(1, len(own))
     if n >= FEWEST_OWN:
@@ -151,10 +163,13 @@ def uncertainty(evidence: Evidence, own: np.ndarray, dataset_id: str) -> Uncerta
 
 def above(values: Values | None, first: str, second: str) -> bool | str | None:
     """
+    Whether a variant scores more than another, by more than seeds could do; without an answer if both diverged.
+
     :param values: scores
     :param first: name
     :param second: name
-    :return: whether the first is above the second, ``CLOSE`` if seeds alone could have made the difference
+    :return: whether the first is above the second, ``CLOSE`` if seeds alone could have made the difference, ``None`` if both
+        diverged or there are no scores
     """
     if values is None or values[first] == values[second] == -math.inf:
         return None
@@ -163,11 +178,13 @@ def above(values: Values | None, first: str, second: str) -> bool | str | None:
 
 def differs(difference: float, one: Uncertainty, other: Uncertainty, n_tests: int = 1) -> bool | str:
     """
+    Sign of a difference of two means by Welch's two-sided test, with no more degrees of freedom than a borrowed deviation has.
+
     :param difference: of two scores
     :param one: uncertainty of the first
     :param other: uncertainty of the second
     :param n_tests: differences any of which would decide a claim: the 5 % are divided among them (Bonferroni)
-    :return: whether it is positive, ``CLOSE`` within the 95 % interval of Welch's test
+    :return: whether it is positive, ``CLOSE`` within the 95 % interval of the test
     """
     error = math.hypot(one.error, other.error)
     if error == 0.0:
@@ -179,11 +196,13 @@ def differs(difference: float, one: Uncertainty, other: Uncertainty, n_tests: in
 
 def spreads_beyond(spreads: Mapping[str, np.ndarray], limit: float, *named: str) -> bool | str | None:
     """
+    Whether scores spread over seeds by more than a limit, tested by the chi-square interval of their standard deviation.
+
     :param spreads: scores by data, one per seed
     :param limit: of their standard deviation
     :param named: beginnings of the data on which the paper has it; without any of these nothing is said against it
     :return: whether it is above on some data, false if it is below on all, by its 95 % interval, divided among the data;
-        ``None`` without the data that are needed, with as many seeds as the paper's
+        ``CLOSE`` if neither; ``None`` without the data that are needed, with as many seeds as the paper's
     """
     known = {name: scores for name, scores in spreads.items() if len(scores) >= PAPER_SEEDS}
     intervals = [sample_std(s) * np.array(std_factors(len(s), 1.0 - 0.05 / len(known))) for s in known.values()]
@@ -196,8 +215,10 @@ def spreads_beyond(spreads: Mapping[str, np.ndarray], limit: float, *named: str)
 
 def all_of(parts: Iterable[bool | str | None]) -> bool | str | None:
     """
+    Outcome of a claim with several parts: a part that is false refutes it, even if others could not be tested.
+
     :param parts: outcomes
-    :return: true if all are, false if one is, else the open one
+    :return: false if one is; else ``None`` if one is; else ``CLOSE`` if one is; else true
     """
     found = list(parts)
     if any(part is False for part in found):
@@ -209,32 +230,40 @@ def all_of(parts: Iterable[bool | str | None]) -> bool | str | None:
 
 def text_of(*parts: Values | None) -> str:
     """
+    Numbers of a claim that compares more than once, without those for which runs are missing.
+
     :param parts: numbers, those that are there
-    :return: their texts
+    :return: their texts, with commas between them
     """
     return ", ".join(text for part in parts if part is not None and (text := part.text()))
 
 
 def falling(values: Values | None) -> bool | None:
     """
+    Whether numbers fall strictly, as Q with a larger beta; how far seeds move them is not asked.
+
     :param values: in the order of the claim
-    :return: whether each is below the one before
+    :return: whether each is below the one before; ``None`` if runs are missing
     """
     return None if values is None else bool(np.all(np.diff(list(values.values())) < 0))
 
 
 def rising(values: Values | None) -> bool | None:
     """
+    Whether numbers rise strictly, as Q with a higher expectile; how far seeds move them is not asked.
+
     :param values: in the order of the claim
-    :return: whether each is above the one before
+    :return: whether each is above the one before; ``None`` if runs are missing
     """
     return None if values is None else bool(np.all(np.diff(list(values.values())) > 0))
 
 
 def scoped(evidence: Evidence) -> Values:
     """
+    Values for a test to fill, with the scope of all variants of the evidence on the grid's first data.
+
     :param evidence: rows of the variants concerned
-    :return: no numbers yet, of the grid's first data
+    :return: no numbers yet; no scope either if there are no rows
     """
     values, dataset_id = Values(), evidence.id_of(None)
     if dataset_id is not None:
@@ -244,10 +273,12 @@ def scoped(evidence: Evidence) -> Values:
 
 def lengths_and_seeds(evidence: Evidence, variant: Variant, dataset_ids: Iterable[str]) -> str:
     """
+    Scope of a statement over several data sets, in which each length with its number of seeds is said once.
+
     :param evidence: rows
     :param variant: agent
     :param dataset_ids: data, each of which has its number under its name
-    :return: scope of a statement over several data sets
+    :return: such as "50,000 steps, 1 seed; 100,000 steps, 3 seeds"
     """
     scopes = [evidence.scope(name, [variant]).removeprefix(f"{name}, ") for name in dataset_ids]
     return "; ".join(dict.fromkeys(scopes))
@@ -275,10 +306,12 @@ def on_this_kind(
 
 def all_diverged(evidence: Evidence, variant: Variant, dataset_id: str | None) -> bool:
     """
+    Whether an agent has runs on these data and every one of them diverged: it has failed, which is a result.
+
     :param evidence: rows
     :param variant: agent
     :param dataset_id: data, ``None`` without any
-    :return: whether every run of it was lost
+    :return: false without data or runs
     """
     if dataset_id is None:
         return False

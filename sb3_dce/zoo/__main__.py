@@ -56,6 +56,8 @@ def main() -> None:
 
 def launch(argv: list[str]) -> None:
     """
+    Check the command, add what rl_zoo3 would lack (agents, packaged hyperparameters), and run its script in this process.
+
     :param argv: script word and its arguments
     :raises ConfigError: if the script, the algorithm or the environment is unknown, or a package is missing
     """

@@ -18,6 +18,8 @@ Params = dict[str, Any]
 
 def convert_bc_params(sampled_params: Params) -> Params:
     """
+    Put the batch size in place of its exponent to the base of 2, which is what a trial draws.
+
     :param sampled_params: parameters of a trial
     :return: constructor keywords
     """
@@ -28,6 +30,8 @@ def convert_bc_params(sampled_params: Params) -> Params:
 
 def convert_critic_params(sampled_params: Params) -> Params:
     """
+    As :func:`convert_bc_params`, with gamma in place of its distance from 1, which a trial draws on a logarithmic scale.
+
     :param sampled_params: parameters of a trial of an agent with critics
     :return: constructor keywords
     """
@@ -38,6 +42,8 @@ def convert_critic_params(sampled_params: Params) -> Params:
 
 def convert_dce_params(sampled_params: Params) -> Params:
     """
+    As :func:`convert_critic_params`, with beta constant at the value of the trial.
+
     :param sampled_params: parameters of a trial of DCE
     :return: constructor keywords; a schedule in the row is switched off, since it belongs to another start value
     """
@@ -46,6 +52,8 @@ def convert_dce_params(sampled_params: Params) -> Params:
 
 def convert_pbrl_params(sampled_params: Params) -> Params:
     """
+    As :func:`convert_critic_params`, with ``ood_weight`` constant at the value of the trial.
+
     :param sampled_params: parameters of a trial of PBRL
     :return: constructor keywords; a schedule in the row is switched off, since it belongs to another start value
     """
@@ -124,6 +132,8 @@ class SearchSpace(NamedTuple):
 
     def sample(self, trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: Params) -> Params:
         """
+        Draw the parameters of all parts for a trial, and convert them; the signature is that of rl_zoo3's samplers.
+
         :param trial: trial of the search
         :param n_actions: unused, as the other arguments of rl_zoo3
         :param n_envs: unused
