@@ -49,8 +49,10 @@ def write_atomically(target: pathlib.Path) -> Iterator[BinaryIO]:
 
 def exists(path: str | PathLike[str]) -> bool:
     """
+    Whether there is something at a path; a folder that may not be entered is an error, not a "no".
+
     :param path: any
-    :return: whether there is something
+    :return: false, too, for what can be no path
     :raises DatasetError: if a folder on the way may not be entered, so that nobody can tell
     """
     try:
@@ -91,6 +93,8 @@ def _remove_abandoned(target: pathlib.Path) -> None:
 
 def process_lives(pid: int) -> bool:
     """
+    Whether a process of this number runs; a half-written file of one that does is left alone.
+
     :param pid: number of a process of this machine
     :return: whether there is one, of whichever user; always true on Windows, where nothing can be asked without harm
     """
@@ -121,6 +125,8 @@ def sync_folder(folder: pathlib.Path) -> None:
 
 def expanded(path: str | PathLike[str]) -> pathlib.Path:
     """
+    A path as the user's shell would read its ``~``, for paths from arguments and the environment.
+
     :param path: may begin with ``~`` or ``~user``
     :return: with their home folder in its place, unless there is none
     """
@@ -132,14 +138,18 @@ def expanded(path: str | PathLike[str]) -> pathlib.Path:
 
 def quoted(path: str | PathLike[str]) -> str:
     """
+    A path as one word on a command line of this system, for commands that are shown to be copied.
+
     :param path: file
-    :return: as it is typed on a command line of this system
+    :return: with quotation marks where they are needed
     """
     return subprocess.list2cmdline([str(path)]) if os.name == "nt" else shlex.quote(str(path))
 
 
 def check_writable(target: pathlib.Path) -> None:
     """
+    Refuse a file that could not be written, before the work whose result it gets.
+
     :param target: file to be written later; missing folders are created
     :raises CheckpointError: if it is a folder, or its folder cannot be made or written
     """
@@ -156,6 +166,8 @@ def check_writable(target: pathlib.Path) -> None:
 
 def cannot_write(target: pathlib.Path, error: OSError) -> CheckpointError:
     """
+    The package's error for a failed write, with the system's reason and what to look at; the caller raises it.
+
     :param target: file that was to be written
     :param error: why it was not
     :return: the error in words

@@ -62,9 +62,7 @@ def _folder() -> Traversable:
 
 
 def known_algorithms() -> list[str]:
-    """
-    :return: names of the algorithms that have a file, in alphabetical order
-    """
+    """Full names of the algorithms with a file of hyperparameters in the package, in alphabetical order."""
     return sorted(entry.name.removesuffix(".yml") for entry in _folder().iterdir() if entry.name.endswith(".yml"))
 
 
@@ -81,7 +79,9 @@ def full_name(algo: str) -> str:
 
 def file_of(algo: str) -> Traversable:
     """
-    :param algo: name of an algorithm, e.g. ``dce``
+    The hyperparameter file of an algorithm; for an unknown name the error lists those that have one.
+
+    :param algo: full name of an algorithm, e.g. ``dce``
     :return: its file inside the installed package
     :raises ConfigError: if there is none
     """
@@ -97,8 +97,11 @@ def file_of(algo: str) -> Traversable:
 
 def read_rows(algo: str) -> dict[str, dict[str, Any]]:
     """
-    :param algo: name of an algorithm, e.g. ``dce``
+    All rows of an algorithm's file, read anew at each call, with keys of the zoo still in them.
+
+    :param algo: full name of an algorithm, e.g. ``dce``
     :return: rows by dataset id, and ``default``; the anchors (``<family>-defaults``) are left out
+    :raises ConfigError: if the algorithm has no file
     """
     rows = yaml.safe_load(file_of(algo).read_text(encoding="utf-8"))
     return {name: row for name, row in rows.items() if not name.endswith("-defaults")}
@@ -131,6 +134,8 @@ def load_row(algo: str, dataset_id: str | None) -> dict[str, Any]:
 
 def split_row(row: dict[str, Any]) -> SplitRow:
     """
+    Separate what the constructor takes from what only rl_zoo3 reads.
+
     :param row: a row as read from the file
     :return: constructor keywords, number of gradient steps, keys of the zoo
     :raises ConfigError: if the row does not say how long to train
@@ -144,6 +149,8 @@ def split_row(row: dict[str, Any]) -> SplitRow:
 
 def constructor_parameters(cls: type) -> dict[str, inspect.Parameter]:
     """
+    What a class can be made with, followed through ``**kwargs`` to its bases; the nearest class wins.
+
     :param cls: class; where its constructor takes ``**kwargs``, those of its bases count, too
     :return: parameters by name, without ``self``, ``*args`` and ``**kwargs``
     """

@@ -29,6 +29,8 @@ ACTION_LIMIT = 1.0 - 1e-5
 @dataclass(frozen=True)
 class IQLOptions(UpdateOptions):
     """
+    What an update of IQL fixes when it is traced, beside the options of every agent.
+
     :param n_masks: hidden layers of the actor with dropout; 0 without dropout
     """
 

@@ -67,7 +67,9 @@ def launch_all(specs: Sequence[RunSpec], workers: int, console: Console) -> list
 
 def raise_first(errors: Sequence[BaseException], console: Console) -> None:
     """
-    :param errors: of runs, after what is complete has been shown; all but the first are printed
+    End a command whose runs have failed: all errors but the first are printed; without errors nothing happens.
+
+    :param errors: of runs, after what is complete has been shown
     :param console: where they are printed
     :raises BaseException: the first
     """
@@ -98,6 +100,8 @@ class _Workers:
 
     def run(self, spec: RunSpec) -> dict[str, Any]:
         """
+        Train in the process of the calling thread, and pass on its progress until the result is there.
+
         :param spec: what is to be run
         :return: its result
         :raises RunFailedError: if no process can be started, or it is killed; the next run of this thread gets a new one
@@ -141,6 +145,8 @@ class _Workers:
 
     def close(self, at_once: bool) -> None:
         """
+        Start no more processes, close the pipes, and wait until all processes have ended.
+
         :param at_once: end the processes whatever they are doing; else they have nothing left to do, and end by themselves
         """
         with self._lock:
@@ -202,6 +208,8 @@ def _save_and_end(futures: Sequence[Future[Any]], workers: _Workers, console: Co
 
 def progress_display(console: Console) -> Progress:
     """
+    Bars for gradient steps, repainted four times a second in a terminal and hardly ever in a log file.
+
     :param console: where the bars are shown
     :return: bars with counts, elapsed and remaining time
     """
@@ -233,6 +241,8 @@ class _Bars:
 
     def show(self, event: runs.Progress) -> None:
         """
+        Move a run's bar, made at its first report, and print the evaluation that the report may bring.
+
         :param event: of one of the runs
         """
         total, display = self._totals[event.name], self._display
@@ -247,6 +257,8 @@ class _Bars:
 
 def show_evaluation(console: Console, name: str, outcome: Evaluation) -> None:
     """
+    Print an evaluation as one line: run, gradient steps, mean and deviation of the returns, score if there is one.
+
     :param console: where to print
     :param name: short name of the run
     :param outcome: of one evaluation

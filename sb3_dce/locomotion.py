@@ -38,6 +38,8 @@ class EnvSteps:
 
     def reset(self, row: int, seed: int | None) -> np.ndarray:
         """
+        Begin an episode in one environment; the others stay where they are.
+
         :param row: of the environment
         :param seed: ``None`` goes on with the environment's generator
         :return: first observation
@@ -46,6 +48,8 @@ class EnvSteps:
 
     def step(self, rows: Sequence[int], actions: np.ndarray, obs: np.ndarray) -> Outcome:
         """
+        Advance some of the environments by one step, and write what they observe into ``obs``.
+
         :param rows: environments that take a step
         :param actions: of all rows, shape (n, *action_shape)
         :param obs: of all rows, shape (n, *obs_shape); those of ``rows`` are overwritten
@@ -126,6 +130,8 @@ class LocomotionSteps(EnvSteps):
 
 def fast_steps(envs: dict[int, gym.Env]) -> EnvSteps:
     """
+    Choose :class:`LocomotionSteps` where an episode of it has the bits of the environment's own, else :class:`EnvSteps`.
+
     :param envs: environments by row, all made alike, without wrappers that keep books
     :return: the fastest way to step them that gives what their own ``step`` gives
     """

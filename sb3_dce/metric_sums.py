@@ -18,6 +18,8 @@ class MetricSums:
 
     def add(self, metrics: dict[str, th.Tensor]) -> None:
         """
+        Take in the metrics of an update that is not captured: sum and count in one call.
+
         :param metrics: of one update, each 0-dimensional, or of shape (models,)
         """
         self.count(self.accumulate(metrics))
@@ -38,12 +40,16 @@ class MetricSums:
 
     def count(self, names: tuple[str, ...]) -> None:
         """
+        Count an update whose metrics the device has added already, as a replayed step does.
+
         :param names: metrics of which one more update has been added
         """
         self._counts[names] += 1
 
     def read(self, clear: bool = True) -> dict[str, float]:
         """
+        Means of a single model as Python numbers; the device is waited for.
+
         :param clear: start new sums
         :return: mean of each metric since the sums were last cleared, names in the order of the updates
         """
@@ -51,6 +57,8 @@ class MetricSums:
 
     def read_members(self, clear: bool = True) -> dict[str, th.Tensor]:
         """
+        Means over the updates that had a metric, for each member of a population; the device is waited for.
+
         :param clear: start new sums
         :return: mean of each metric since the sums were last cleared, each of shape () or (models,), on the CPU
         """

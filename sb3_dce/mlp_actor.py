@@ -52,6 +52,8 @@ class ActorSnapshot:
 
 def actor_snapshot(policy: Any) -> ActorSnapshot | None:
     """
+    Copy what a policy's deterministic action depends on, if it is a policy that :class:`MLPActor` can repeat.
+
     :param policy: policy of Stable-Baselines3 or of this package
     :return: its weights as they are now; ``None`` if it is no plain float32 MLP on vectors of known kind
     """
@@ -100,6 +102,8 @@ class MLPActor:
 
     def __call__(self, obs: np.ndarray) -> np.ndarray:
         """
+        Deterministic actions of a batch; a batch of another size than the last one gets new buffers.
+
         :param obs: shape (n, obs_dim)
         :return: actions in the units of the environment, shape (n, act_dim); a new array
         """

@@ -25,6 +25,8 @@ class KeepDtype:
 
     def extract_features(self, obs: PyTorchObs, features_extractor: BaseFeaturesExtractor | None) -> th.Tensor:
         """
+        Apply an extractor in the network's dtype; a Box skips Stable-Baselines3's preprocessing.
+
         :param obs: shape (batch, *obs_shape)
         :param features_extractor: network applied to the observations
         :return: features, shape (batch, features_dim)
@@ -61,6 +63,8 @@ class OfflineActor(KeepDtype, Actor):
 
     def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """
+        A draw of the squashed Gaussian, or ``tanh`` of its mean.
+
         :param obs: shape (batch, *obs_shape)
         :param deterministic: without noise; then no distribution is made, which takes longer than the network
         :return: actions in [-1, 1], shape (batch, action_dim)
@@ -126,6 +130,8 @@ class OfflineCritic(KeepDtype, ContinuousCritic):
         self, obs: th.Tensor, actions: th.Tensor, masks: Sequence[Sequence[th.Tensor]] | None = None
     ) -> tuple[th.Tensor, ...]:
         """
+        Q(s, a) of every critic from one extraction of the features, with dropout where masks are given.
+
         :param obs: shape (batch, *obs_shape)
         :param actions: scaled to [-1, 1], shape (batch, action_dim)
         :param masks: per critic and hidden layer a factor of shape (batch, width): 0, or 1 / (1 - dropout)
@@ -176,6 +182,8 @@ class ValueNet(KeepDtype, BaseModel):
 
     def forward(self, obs: th.Tensor) -> th.Tensor:
         """
+        Estimate each state's value; what it estimates, such as an expectile of Q, is the update's choice.
+
         :param obs: shape (batch, *obs_shape)
         :return: V(s), shape (batch, 1), reward units
         """
@@ -215,6 +223,8 @@ class StandardizedExtractor(BaseFeaturesExtractor):
 
     def set_statistics(self, mean: th.Tensor, std: th.Tensor) -> None:
         """
+        Copy the dataset's statistics into the buffers, in place; training does not change them.
+
         :param mean: shape (obs_dim,)
         :param std: population standard deviation, shape (obs_dim,)
         """
@@ -223,6 +233,8 @@ class StandardizedExtractor(BaseFeaturesExtractor):
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         """
+        Standardise observations, each flattened to a vector; before statistics are set they stay as they are.
+
         :param observations: shape (batch, *obs_shape)
         :return: shape (batch, obs_dim)
         """

@@ -23,7 +23,9 @@ class NoiseSpec:
 
     def draw(self, generator: th.Generator, device: th.device, dtype: th.dtype) -> th.Tensor:
         """
-        :param generator: source of the randomness
+        Fresh numbers of this kind for one update, made on the device itself.
+
+        :param generator: source of the randomness, of the same device
         :param device: where the tensor lies
         :param dtype: floating-point type
         :return: tensor of the given shape

@@ -16,6 +16,8 @@ FEWEST_OBSERVATIONS = 2000
 
 def is_untouched(statistics: RunningMeanStd) -> bool:
     """
+    Whether running statistics are as ``VecNormalize`` makes them, and so say nothing of a task.
+
     :param statistics: of a ``VecNormalize``
     :return: whether they have seen nothing and nobody has set them
     """

@@ -69,9 +69,7 @@ class NumpyPolicy(ABC):
 
     @property
     def act_dim(self) -> int:
-        """
-        :return: number of entries of an action
-        """
+        """Number of entries of an action, which is that of the bounds."""
         return len(self.low)
 
     def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
@@ -86,14 +84,14 @@ class NumpyPolicy(ABC):
 
     @property
     def weight_bytes(self) -> int:
-        """
-        :return: size of the arrays that are read for every action
-        """
+        """Bytes of weights that every action reads; if they are many, a recording plays episodes side by side. 0: unknown."""
         return 0
 
     @abstractmethod
     def act(self, obs: np.ndarray, noise: np.ndarray | None = None, step: int = 0) -> np.ndarray:
         """
+        Actions of a batch of observations, all at the same step of their episodes.
+
         :param obs: shape (n, obs_dim)
         :param noise: from :meth:`draw`, shape (n, act_dim); ``None`` for the deterministic action
         :param step: steps since the start of the episode, for policies that see the time
@@ -117,6 +115,8 @@ class ObsNormalizer:
 
     def __call__(self, obs: np.ndarray) -> np.ndarray:
         """
+        Standardise each entry of a batch, then clip it; nothing is learned from the observations.
+
         :param obs: shape (n, obs_dim)
         :return: shape (n, obs_dim)
         """
@@ -174,9 +174,7 @@ class MLPPolicy(NumpyPolicy):
 
     @property
     def weight_bytes(self) -> int:
-        """
-        :return: size of the arrays that are read for every action
-        """
+        """Bytes of the weight matrices from the observation to the mean, without biases and the layer of log std."""
         return sum(weight.nbytes for weight, _ in self.layers)
 
     def act(self, obs: np.ndarray, noise: np.ndarray | None = None, step: int = 0) -> np.ndarray:

@@ -37,6 +37,8 @@ class OODWeight(OfflineAlgorithm):
 
     def check_parameters(self) -> None:
         """
+        Refuse weights below 0, phases shorter than one step, and a divisor that would not lower the weight.
+
         :raises ConfigError: if a parameter is out of its range
         """
         super().check_parameters()
@@ -56,6 +58,8 @@ class OODWeight(OfflineAlgorithm):
 
     def make_storages(self) -> dict[str, Storage]:
         """
+        Give the state tree a place for the recorded Q where the weight is adaptive.
+
         :return: storage of each network, and of further learners, by name
         """
         storages = super().make_storages()
@@ -65,6 +69,8 @@ class OODWeight(OfflineAlgorithm):
 
     def coefficients(self, n_updates: int) -> dict[str, float]:
         """
+        Add both weights of the disagreement: the one at s, which may fall, and the constant one at s'.
+
         :param n_updates: completed updates
         :return: numbers of the next update that may change while training
         """
@@ -73,6 +79,8 @@ class OODWeight(OfflineAlgorithm):
 
     def ood_weight_at(self, n_updates: int) -> float:
         """
+        Linear from ``ood_weight`` to ``ood_weight_final`` over ``ood_weight_steps``, divided as the adaptive rule has it.
+
         :param n_updates: completed updates
         :return: w_s of the next update; the adaptive divisions are those made so far
         """
@@ -82,13 +90,17 @@ class OODWeight(OfflineAlgorithm):
 
     def reads_state_after(self, n_updates: int) -> bool:
         """
+        When the adaptive weight records one more value: after the first update of each epoch, as in the authors' code.
+
         :param n_updates: completed updates
-        :return: whether one more value is to be recorded: after the first update of each epoch, as in the authors' code
+        :return: whether that is now; never with a weight that is not adaptive
         """
         return self.adaptive_ood_weight and (n_updates - 1) % self.steps_per_epoch == 0
 
     def read_state(self, state: dict[str, Any]) -> None:
         """
+        Apply the adaptive rule to the Q that the last update left in the state; the device is waited for.
+
         :param state: state tree of the model on the device
         """
         self.adapt_ood_weight(float(state[OOD_Q]))

@@ -93,12 +93,15 @@ def _total_rows(evidence: Evidence, methods: list[str]) -> list[tuple[str, ...]]
 
 def score_cell(evidence: Evidence, variant: Variant, dataset_id: str, best: Interval | None, usual: int) -> str:
     """
+    One agent's scores on one data set, in bold where their interval overlaps that of the row's best.
+
     :param evidence: rows
     :param variant: column
     :param dataset_id: row
     :param best: interval of the best mean of the row, ``None`` if that has one seed
     :param usual: commonest number of seeds of the row
-    :return: mean, deviation, number of seeds if it is not the usual one, and how many diverged
+    :return: mean, deviation, number of seeds if it is not the usual one, and how many diverged; without runs of the row's
+        length the scores of its longest, marked as such, or "-"
     """
     scores, diverged = evidence.last(variant, dataset_id), evidence.n_diverged(variant, dataset_id)
     lost = f" ({diverged} diverged)" if diverged else ""
@@ -139,8 +142,10 @@ def _paper_cell(dataset: str, method: str) -> str:
 
 def parts_of(evidence: Evidence) -> list[str]:
     """
+    Parts of the data by source and family; a total is formed over one of them, never over two.
+
     :param evidence: of an experiment with a table
-    :return: what totals are formed over, never over two of them: "D4RL" and "sb3", with a family behind if there are several
+    :return: "D4RL" and "sb3", with a family behind if there are several
     """
     families = list(dict.fromkeys(resolve(dataset.paper).family for dataset in evidence.experiment.datasets))
     endings = [f"-{family}" for family in families] if len(families) > 1 else [""]
@@ -149,6 +154,8 @@ def parts_of(evidence: Evidence) -> list[str]:
 
 def common_rows(evidence: Evidence, part: str) -> list[str]:
     """
+    The data that totals and performance profiles are taken over.
+
     :param evidence: rows
     :param part: one of :func:`parts_of`
     :return: data of this part on which every agent of the paper has runs, all of the commonest length, but for agents that
@@ -167,6 +174,8 @@ def common_rows(evidence: Evidence, part: str) -> list[str]:
 
 def compared(evidence: Evidence, ids: list[str]) -> list[Variant]:
     """
+    Agents that aggregates may compare; those that the grid has on some data only are left out.
+
     :param evidence: rows
     :param ids: data
     :return: columns with runs on all of them that are not DCE once more ("one setting" where it is the row's everywhere)
@@ -183,10 +192,12 @@ def compared(evidence: Evidence, ids: list[str]) -> list[Variant]:
 
 def n_diverged(evidence: Evidence, variant: Variant, ids: list[str]) -> int:
     """
+    Diverged runs of an agent over several data sets; with a single one it has neither a total nor a profile.
+
     :param evidence: rows
     :param variant: column
     :param ids: data
-    :return: its runs there that diverged; an agent with one has failed, and what is left of it is no total
+    :return: their number; an agent with one has failed, and what is left of it is no total
     """
     return sum(evidence.n_diverged(variant, name) for name in ids)
 
@@ -203,6 +214,8 @@ def _counted(n: int) -> str:
 
 def aggregate_tables(evidence: Evidence) -> dict[str, TextTable]:
     """
+    One table of aggregates for each part of the data that has common rows.
+
     :param evidence: of an experiment with a table
     :return: by part of :func:`parts_of` totals, interquartile means and probabilities of improvement
     """
@@ -260,8 +273,10 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
 
 def long_table(evidence: Evidence) -> TextTable:
     """
+    Results for programs, to four decimals, with runs of every length instead of the row's alone.
+
     :param evidence: rows
-    :return: one line per data, agent and length, for programs: last score, mean of the last ten evaluations, best, per seed
+    :return: one line per data, agent and length: last score, mean of the last ten evaluations, best, per seed
     """
     header = (
         *("dataset", "source", "agent", "hyperparameters", "n_updates", "n_seeds", "n_diverged", "mean", "std", "ci_low"),

@@ -26,34 +26,30 @@ class TextTable:
     caption: str
 
     def markdown(self) -> str:
-        """
-        :return: table and caption
-        """
+        """The table in Markdown, bold cells as they are, and the caption as a paragraph below it."""
         lines = [self.header, tuple("---" for _ in self.header), *self.rows]
         return "\n".join("| " + " | ".join(cells) + " |" for cells in lines) + f"\n\n{self.caption}\n"
 
     def latex(self) -> str:
-        """
-        :return: ``table`` environment; needs the package booktabs
-        """
+        """A LaTeX ``table`` environment with the caption below; it needs the package booktabs."""
         lines = [r"\begin{table}", r"\centering", r"\begin{tabular}{l" + "r" * (len(self.header) - 1) + "}", r"\toprule"]
         body = [" & ".join(_latex(cell) for cell in cells) + r" \\" for cells in (self.header, *self.rows)]
         lines += [body[0], r"\midrule", *body[1:], r"\bottomrule", r"\end{tabular}"]
         return "\n".join([*lines, rf"\caption{{{_latex(self.caption)}}}", r"\end{table}", ""])
 
     def csv(self) -> str:
-        """
-        :return: cells without marks of bold
-        """
+        """Header and rows as comma-separated values, without marks of bold and without the caption."""
         text = io.StringIO(newline="")
         csv.writer(text).writerows([self.header, *([c.replace("**", "") for c in row] for row in self.rows)])
         return text.getvalue()
 
     def write(self, folder: Path, name: str, endings: Sequence[str] = ("md", "tex", "csv")) -> list[Path]:
         """
-        :param folder: of the tables
+        Write the table in several formats; files of the same name are replaced.
+
+        :param folder: of the tables; made if it is missing
         :param name: of the files, without ending
-        :param endings: which files
+        :param endings: which files, of "md", "tex" and "csv"
         :return: files
         """
         folder.mkdir(parents=True, exist_ok=True)

@@ -51,6 +51,8 @@ from sb3_dce.theory import penalty_bound
 
 def verdicts(evidence: Evidence) -> list[Verdict]:
     """
+    Judge the paper's claims that an experiment tests; one without claims has no verdicts.
+
     :param evidence: rows of one experiment
     :return: one verdict per claim it tests
     """
