@@ -36,7 +36,7 @@ class GaussianActor(KeepDtype, BasePolicy):
     :param features_extractor: network applied to the observations first
     :param features_dim: its output width
     :param activation_fn: activation of the hidden layers
-    :param normalize_images: divide image observations by 255
+    :param normalize_images: kept for Stable-Baselines3's interface; observations are never divided by 255
     """
 
     def __init__(

@@ -33,6 +33,7 @@ from sb3_dce.errors import (
     DatasetNotFoundError,
     DatasetSemanticsError,
     DatasetWarning,
+    SB3DCEError,
     SB3DCEWarning,
 )
 from sb3_dce.networks import StandardizedExtractor
@@ -169,11 +170,20 @@ class AttachingMixin(OffPolicyAlgorithm):
 
         :param path: file that ``save_replay_buffer`` wrote. It is a pickle: open only files you trust
         :param truncate_last_traj: kept for Stable-Baselines3
+        :raises DatasetFormatError: if its observations or actions have other widths than the model's
+        :raises DatasetSemanticsError: if its actions were scaled from other bounds than the model's
         """
+        before = self.replay_buffer
         super().load_replay_buffer(path, truncate_last_traj)
         if not isinstance(self.replay_buffer, OfflineReplayBuffer):
             self.set_dataset(Transitions.from_replay_buffer(self.replay_buffer))
-        elif self.dataset_statistics is not None and self.replay_buffer.size() > 0:
+            return
+        try:
+            self.replay_buffer.check_fits(self.observation_space, self.action_space, where=str(path))
+        except SB3DCEError:
+            self.replay_buffer = before
+            raise
+        if self.dataset_statistics is not None and self.replay_buffer.size() > 0:
             if self.dataset_statistics.get("sample_hash") != self.replay_buffer.sample_hash():
                 self.forget_rows()
 
@@ -188,31 +198,31 @@ class AttachingMixin(OffPolicyAlgorithm):
 
     def _remember_dataset(self, dataset: DatasetLike | None) -> DatasetSpec | None:
         """Keep the id or path (saved), and the data themselves if they were given as an object (never saved)."""
-        self._transitions, self.dataset = None, None
+        # all at once and last: what is refused leaves the model as it was
+        self._transitions, self.dataset, spec = self._named_dataset(dataset)
+        return spec
+
+    def _named_dataset(self, dataset: DatasetLike | None) -> tuple[Transitions | None, str | None, DatasetSpec | None]:
+        """The data themselves if they are an object; the id or path under which they are found again; their entry."""
         if dataset is None:
-            return None
+            return None, None, None
         dataset = as_dataset(dataset)
         if isinstance(dataset, Transitions):
-            self._transitions = dataset
             if self.d4rl_compat and not dataset.info.d4rl_compat:
                 raise ConfigError(
                     "d4rl_compat=True comes too late: the Transitions have already been made without it",
                     key="d4rl_compat",
                     hint="Pass d4rl_compat=True to Transitions.from_hdf5 or load_transitions.",
                 )
-            self.dataset = None if dataset.info.path is None else str(Path(dataset.info.path).resolve())
-            return None
+            return dataset, None if dataset.info.path is None else str(Path(dataset.info.path).resolve()), None
         if is_path(dataset):
             path, spec = find_file(dataset)
-            self.dataset = str(path.resolve())  # a relative path would be lost after a change of folder
-            return spec
+            return None, str(path.resolve()), spec  # a relative path would be lost after a change of folder
         if is_minari_name(dataset):
             find_file(dataset)  # it need not be known, but here
-            self.dataset = os.fspath(dataset)
-            return None
+            return None, os.fspath(dataset), None
         spec = resolve(os.fspath(dataset))
-        self.dataset = spec.id
-        return spec
+        return None, spec.id, spec
 
     def _spaces_env(self, spec: DatasetSpec | None, verbose: int) -> gym.Env:
         """Environment without a simulator, from the catalogue or from the data; the latter is said if anything is."""
@@ -263,9 +273,10 @@ class AttachingMixin(OffPolicyAlgorithm):
     def _refuse_other_width(self, space: spaces.Box) -> None:
         """What the catalogue knows of the data is said before they are read with bounds that cannot fit."""
         spec = None if self.dataset is None or is_minari_name(self.dataset) else find_file(self.dataset)[1]
-        if spec is not None and spec.act_dim != int(np.prod(space.shape)):
+        width = int(np.prod(space.shape))
+        if spec is not None and spec.act_dim != width:
             raise ConfigError(
-                f"the dataset {spec.id} has actions of width {spec.act_dim}, the model's environment of {space.shape[0]}",
+                f"the dataset {spec.id} has actions of width {spec.act_dim}, the model's environment of {width}",
                 key="env",
                 hint="Use the environment the data were recorded in, or none.",
             )

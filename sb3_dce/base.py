@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import time
+import warnings
 from contextlib import nullcontext
 from typing import Any, ClassVar, TypeVar
 
@@ -26,7 +27,7 @@ from sb3_dce.checks import check_choice, check_number, check_optional, check_see
 from sb3_dce.diagnostics import RECORDED, DiagnosticsMixin
 from sb3_dce.divergence import Rewind, locate
 from sb3_dce.envs import SpacesEnv
-from sb3_dce.errors import ConfigError, DivergenceError
+from sb3_dce.errors import ConfigError, DivergenceError, SB3DCEWarning
 from sb3_dce.execution import EXECUTIONS, Engine, Update, choose_execution
 from sb3_dce.hyperparams import constructor_parameters
 from sb3_dce.networks import StandardizedExtractor
@@ -42,6 +43,7 @@ from sb3_dce.sb3_checks import (
     check_one_env,
     check_spaces,
     named_env,
+    nested_callbacks,
     policy_arguments,
     python_number,
 )
@@ -325,14 +327,12 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         self._coef = {}
 
     def setup_extras(self) -> None:
-        """Create what the networks do not hold: numbers that are learned, and the random generator."""
+        """Create what the networks do not hold: numbers that are learned, each with its optimizer."""
         for name, number in self.learned_numbers().items():
             tensor = None if number.start is None else number.start.to(self.device).requires_grad_(True)
             setattr(self, name, tensor)
             optimizer = None if tensor is None else th.optim.Adam([tensor], lr=number.learning_rate)
             setattr(self, number.optimizer, optimizer)
-        if not hasattr(self, "rng_state"):
-            self._seed_generator(self.seed)
 
     def set_random_seed(self, seed: int | None = None) -> None:
         seed = check_seed(seed)
@@ -351,8 +351,11 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
             self._generator = th.Generator(device=self.device)
             try:
                 self._generator.set_state(self.rng_state.cpu())  # loading a model puts it on the model's device
-            except RuntimeError:  # saved on another kind of device
-                self._generator.manual_seed(0 if self.seed is None else self.seed)
+            except RuntimeError:  # saved on another kind of device, which has another kind of state
+                entropy = None if self.seed is None else (self.seed, self._n_updates)  # not the numbers of the beginning
+                self._generator.manual_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
+                text = f"the model was saved on another kind of device: on {self.device.type} other random numbers follow"
+                warnings.warn(text, SB3DCEWarning)
         return self._generator
 
     def hyperparameters(self) -> dict[str, Any]:
@@ -494,7 +497,7 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         Train on the dataset.
 
         :param total_timesteps: gradient steps, a whole number; ``1e6`` is accepted
-        :param callback: called after every gradient step
+        :param callback: called after every gradient step; where it has a method ``on_training_failed()``, also after an error
         :param log_interval: gradient steps between two log rows; ``None`` logs nothing by itself
         :param tb_log_name: name of the TensorBoard run, default the class name
         :param reset_num_timesteps: start counting timesteps from 0; ``_n_updates``, which drives beta, always goes on
@@ -512,12 +515,19 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         )
         self._check_frequencies(callback, log_interval)
         callback.on_training_start(locals(), globals())
-        keep_going, begin = True, self.num_timesteps
+        try:
+            self._train_until(total_timesteps, callback, log_interval)
+        except BaseException:
+            for part in nested_callbacks(callback):
+                getattr(part, "on_training_failed", lambda: None)()
+            raise
+        callback.on_training_end()
+        return self
+
+    def _train_until(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
+        keep_going = True
         while keep_going and self.num_timesteps < total_timesteps:
-            # Up to where a callback may be due: some count timesteps, Stable-Baselines3's the calls of this ``learn()``, which
-            # may begin between two multiples.
-            done, g = self.num_timesteps, self.gradient_steps
-            chunk = min(g - done % g, g - (done - begin) % g, total_timesteps - done)
+            chunk = min(self._chunk_around(self.num_timesteps)[1], total_timesteps) - self.num_timesteps
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
             timesteps, updates = self.num_timesteps, self._n_updates
             try:
@@ -527,8 +537,15 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
                 self.num_timesteps = timesteps + self._n_updates - updates  # what is saved now can go on
                 raise
         self._refuse_divergence()  # a run may be shorter than the intervals of the log
-        callback.on_training_end()
-        return self
+
+    def _chunk_around(self, timestep: int) -> tuple[int, int]:
+        """
+        Begin and end of the chunk of updates that the next one after ``timestep`` is in. It ends where a callback may be due:
+        some count timesteps, Stable-Baselines3's the calls of this ``learn()``, which may begin between two multiples.
+        """
+        g = self.gradient_steps
+        done = (timestep % g, (timestep - self._num_timesteps_at_start) % g)
+        return timestep - min(done), timestep + g - max(done)
 
     def _setup_learn(
         self,

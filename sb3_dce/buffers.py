@@ -102,13 +102,7 @@ class OfflineReplayBuffer(ReplayBuffer):
         :raises DatasetSemanticsError: if actions lie outside of this buffer's action space
         """
         got = (int(np.prod(transitions.obs_shape)), transitions.act_dim)
-        if got != (self.obs_dim, self.action_dim):
-            raise DatasetFormatError(
-                f"the dataset has observations of width {got[0]} and actions of width {got[1]}, "
-                f"the model wants {self.obs_dim} and {self.action_dim}",
-                where=str(transitions.info.path or transitions.info.id),
-                hint="Use the environment the data were recorded in, or another dataset.",
-            )
+        _refuse_widths(got, (self.obs_dim, self.action_dim), str(transitions.info.path or transitions.info.id))
         self._refuse_actions_outside(transitions)
         self._warn_of_other_bounds(transitions)
         rows, timeouts = th.from_numpy(transitions._base_rows), transitions.timeouts
@@ -117,6 +111,31 @@ class OfflineReplayBuffer(ReplayBuffer):
         self.rows = self._with_scaled_actions(rows).to(self._device)
         self._timeouts = timeouts
         self.buffer_size, self.pos, self.full = len(rows), 0, True
+
+    def check_fits(self, observation_space: spaces.Space, action_space: spaces.Space, where: str) -> None:
+        """
+        Refuse a buffer from elsewhere whose rows a model would misread: their actions are scaled from this buffer's bounds.
+
+        :param observation_space: that of the model
+        :param action_space: that of the model
+        :param where: where the buffer is from, for the message
+        :raises DatasetFormatError: if the widths differ
+        :raises DatasetSemanticsError: if the bounds of the actions differ
+        """
+        assert observation_space.shape is not None
+        wanted = (int(np.prod(observation_space.shape)), get_action_dim(action_space))
+        _refuse_widths((self.obs_dim, self.action_dim), wanted, where)
+        own, other = self.action_space, action_space
+        assert isinstance(own, spaces.Box) and isinstance(other, spaces.Box)
+        pairs = ((own.low, other.low), (own.high, other.high))
+        if not all(np.allclose(np.ravel(a), np.ravel(b), rtol=1e-5) for a, b in pairs):
+            raise DatasetSemanticsError(
+                f"the buffer's actions were scaled from {own.low.min():g} to {own.high.max():g}, the model's are from "
+                f"{other.low.min():g} to {other.high.max():g}",
+                where=where,
+                hint="Load it into a model with the environment that it was filled for.",
+                key="actions",
+            )
 
     def _refuse_actions_outside(self, transitions: Transitions) -> None:
         space, info = self.action_space, transitions.info
@@ -307,3 +326,13 @@ class OfflineReplayBuffer(ReplayBuffer):
         state["rows"] = None if self.rows is None else self.rows.cpu()
         state["_device"] = th.device("cpu")
         return state
+
+
+def _refuse_widths(got: tuple[int, int], wanted: tuple[int, int], where: str) -> None:
+    if got != wanted:
+        raise DatasetFormatError(
+            f"the data have observations of width {got[0]} and actions of width {got[1]}, "
+            f"the model wants {wanted[0]} and {wanted[1]}",
+            where=where,
+            hint="Use the environment the data were recorded in, or other data.",
+        )

@@ -10,6 +10,8 @@ from typing import Any
 from sb3_dce.errors import ConfigError
 
 LAST_SEED = 2**32 - 1  # of NumPy's generators
+# Seeds of two evaluations must not overlap; no evaluation has more environments than this.
+SEEDS_PER_EVALUATION = 10_000
 
 
 def check_number(
@@ -118,16 +120,18 @@ def check_widths(name: str, value: Any, hint: str = "For example [256, 256].") -
         raise ConfigError(f"{name} must be a list of numbers of units, got {value!r}", key=name, hint=hint)
 
 
-def did_you_mean(name: str, candidates: Iterable[str]) -> str:
+def did_you_mean(name: str, candidates: Iterable[str], n: int = 1, cutoff: float = 0.6) -> str:
     """
     First part of a hint on a misspelt name, with a blank behind it so that more can follow.
 
     :param name: what the user wrote
     :param candidates: what is allowed
-    :return: "Did you mean '...'? " with the closest candidate, or an empty string
+    :param n: candidates to name at most
+    :param cutoff: how alike they must be, from 0 to 1, as of ``difflib``
+    :return: "Did you mean '...'? " with the closest candidates, or an empty string
     """
-    close = difflib.get_close_matches(name, list(candidates), n=1)
-    return f"Did you mean {close[0]!r}? " if close else ""
+    close = difflib.get_close_matches(name, list(candidates), n, cutoff)
+    return f"Did you mean {', '.join(map(repr, close))}? " if close else ""
 
 
 def check_ends_with_evaluation(n_updates: int, eval_freq: int, whose: str = "") -> None:

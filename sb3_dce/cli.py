@@ -14,7 +14,7 @@ import yaml
 from rich.console import Console
 
 from sb3_dce import cli_datasets
-from sb3_dce.checks import LAST_SEED, check_steps
+from sb3_dce.checks import LAST_SEED, SEEDS_PER_EVALUATION, check_steps
 from sb3_dce.cli_datasets import DatasetArgument
 from sb3_dce.errors import ConfigError, SB3DCEError
 from sb3_dce.messages import show_warnings_as_lines
@@ -76,7 +76,7 @@ def train(
     seeds: Annotated[int, typer.Option(min=1, help="Number of seeds, each a run of its own.")] = 1,
     first_seed: Annotated[int, typer.Option(min=0, max=LAST_SEED, help="The first of them.")] = 0,
     eval_freq: Annotated[int, typer.Option(min=1, help="Gradient steps between two evaluations and checkpoints.")] = 5000,
-    eval_episodes: Annotated[int, typer.Option(min=1, help="Episodes of each evaluation.")] = 10,
+    eval_episodes: Annotated[int, typer.Option(min=1, max=SEEDS_PER_EVALUATION, help="Episodes of each evaluation.")] = 10,
     workers: Annotated[int, typer.Option(min=0, show_default=False, help="Processes; default: one per core.")] = 0,
     out: Annotated[Path | None, typer.Option(help="Folder of the results; default runs/<algo>-<dataset>.")] = None,
     set_: Annotated[
@@ -113,7 +113,7 @@ def compare(
     updates: Annotated[float, typer.Option(min=1, help="Gradient steps of each run, e.g. 1e5.")] = 1e6,
     seeds: Annotated[int, typer.Option(min=1, help="Seeds of each agent.")] = 3,
     eval_freq: Annotated[int, typer.Option(min=1, help="Gradient steps between two evaluations and checkpoints.")] = 5000,
-    eval_episodes: Annotated[int, typer.Option(min=1, help="Episodes of each evaluation.")] = 10,
+    eval_episodes: Annotated[int, typer.Option(min=1, max=SEEDS_PER_EVALUATION, help="Episodes of each evaluation.")] = 10,
     workers: Annotated[int, typer.Option(min=0, show_default=False, help="Processes; default: one per core.")] = 0,
     out: Annotated[
         Path | None, typer.Option(show_default=False, help="Folder of the results; default runs/compare-<dataset>.")
@@ -234,7 +234,7 @@ def reproduce(
 def evaluate(
     model: Annotated[Path, typer.Argument(help="Zip file of a trained agent.")],
     dataset: Annotated[str | None, typer.Option(help="Id that names environment and score; default: the model's own.")] = None,
-    episodes: Annotated[int, typer.Option(min=1, help="Episodes.")] = 10,
+    episodes: Annotated[int, typer.Option(min=1, max=SEEDS_PER_EVALUATION, help="Episodes.")] = 10,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first episode.")] = 0,
     env: Annotated[
         str | None, typer.Option(show_default=False, help="Id of an environment, for models of data that have none.")

@@ -93,7 +93,7 @@ def compare_two_datasets(
     For data that were made again on another machine, whose bits differ. The exit code is 1 if they are different.
     """
     from sb3_dce.data.comparison import DIFFERENT, DatasetCard, compare_datasets
-    from sb3_dce.data.minari import METADATA_FILE
+    from sb3_dce.data.hashes import METADATA_FILE
 
     def card_of(name: str) -> DatasetCard:
         is_card = name.endswith(".json") and Path(name).name != METADATA_FILE

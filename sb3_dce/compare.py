@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import inspect
 import io
 import json
 from collections.abc import Mapping, Sequence
@@ -16,7 +15,6 @@ from rich.markup import escape
 from rich.table import Table
 
 from sb3_dce.agents import agent_class
-from sb3_dce.checks import check_ends_with_evaluation
 from sb3_dce.configuration import config_hash
 from sb3_dce.data import find_file, load_transitions
 from sb3_dce.data.catalog import DatasetSpec, normalized_score
@@ -25,7 +23,7 @@ from sb3_dce.data.locate import short_name
 from sb3_dce.errors import ConfigError, DivergenceError
 from sb3_dce.evaluation import read_evaluations
 from sb3_dce.files import write_text
-from sb3_dce.hyperparams import check_keys, full_name
+from sb3_dce.hyperparams import check_keys, constructor_parameters, full_name
 from sb3_dce.launch import launch_all, raise_first
 from sb3_dce.plots import plot_learning_curves
 from sb3_dce.run_files import RunSpec, last_metrics, read_config, read_divergence, read_result, spec_from
@@ -105,7 +103,7 @@ def compare(
             f"name each agent once, got {', '.join(algos)}", key="--algos", hint="For example --algos dce,offline_bc."
         )
     settings = settings_of(algos, overrides or {})
-    lengths = _lengths(algos, n_updates, updates_of or {}, eval_freq)
+    named = {_one_of(algos, algo, "--updates-of"): length for algo, length in (updates_of or {}).items()}
     path, _ = find_file(dataset)
     name, folder = short_name(dataset), out or default_folder(dataset)
     console.print(
@@ -114,7 +112,7 @@ def compare(
     )
     specs = [
         RunSpec(
-            *(algo, dataset, seed, lengths[algo], str(folder / algo / f"seed_{seed}")),
+            *(algo, dataset, seed, named.get(algo, n_updates), str(folder / algo / f"seed_{seed}")),
             *(eval_freq, n_eval_episodes, settings[algo]),
         )
         for seed in seeds  # all agents of a seed before the next seed: an interrupted comparison is a smaller one
@@ -150,6 +148,7 @@ def report(dataset: str, algos: Sequence[str], out: Path | None, console: Consol
     :return: the table
     :raises ConfigError: without a complete run, or if one was trained on another file
     """
+    here = sha256_once(find_file(dataset)[0])
     folder, wanted = out or default_folder(dataset), {full_name(algo) for algo in algos}
     runs: dict[str, dict[tuple[str, str], list[RunSpec]]] = {}
     for path in sorted(folder.glob("*/seed_*"), key=lambda path: (path.parent.name, len(path.name), path.name)):
@@ -161,7 +160,7 @@ def report(dataset: str, algos: Sequence[str], out: Path | None, console: Consol
             continue
         # a complete run may be on its way to become a longer one
         spec = spec_from(config["run"] if result is None else result["config"], path)
-        if config["dataset"]["sha256"] != sha256_once(find_file(dataset)[0]):
+        if config["dataset"]["sha256"] != here:
             what = f"trained on another file ({config['dataset']['name']}) than {dataset}"
             raise ConfigError(what, where=str(path), hint="Name that one, or another folder with --out.")
         how = f"{spec.n_updates:,} updates{''.join(f', {k}={v}' for k, v in sorted(spec.overrides.items()))}"
@@ -206,20 +205,12 @@ def settings_of(algos: Sequence[str], overrides: Mapping[str, Any]) -> dict[str,
             check_keys(classes[algo], [key], where="--set", zoo_keys=False)
             settings[algo][key] = value
             continue
-        having = [algo for algo, cls in classes.items() if key in inspect.signature(cls).parameters]
+        having = [algo for algo, cls in classes.items() if key in constructor_parameters(cls)]
         if not having:
             check_keys(classes[algos[0]], [key], where="--set", zoo_keys=False)
         for algo in having:
             settings[algo].setdefault(key, value)  # what is set for one agent alone counts more
     return settings
-
-
-def _lengths(algos: Sequence[str], n_updates: int, updates_of: Mapping[str, int], eval_freq: int) -> dict[str, int]:
-    named = {_one_of(algos, name, "--updates-of"): length for name, length in updates_of.items()}
-    lengths = {algo: named.get(algo, n_updates) for algo in algos}
-    for algo, length in lengths.items():
-        check_ends_with_evaluation(length, eval_freq, f" of {algo}")
-    return lengths
 
 
 def _one_of(algos: Sequence[str], name: str, key: str) -> str:
@@ -269,12 +260,12 @@ def summarize(
             "the mean distance of the policy's actions from the data's (scaled to [-1, 1]), q_data what the critics expect. "
             "They say which agents stay near the data and which critics diverge, not which policy is best."
         )
+    elif without := [row.agent for row in rows if np.isnan(row.mean)]:
+        notes.append(f"Not evaluated, since there was no simulator when they were trained: {', '.join(without)}.")
     _show(table, console)
     for note in notes:
         console.print(note, markup=False)
     curves = {algo: [read_evaluations(run, dataset_id) for run in found] for algo, found in runs.items()}
-    # a run without evaluations has no part in the mean, which goes as far as the shortest
-    curves = {algo: evaluated for algo, seeds in curves.items() if (evaluated := [seed for seed in seeds if seed])}
     levels = {} if level is None else {"mean of the data": level}
     title = short_name(specs[0].dataset) if dataset_id is None else dataset_id
     picture = plot_learning_curves(curves, folder / "comparison.png", title, levels, confidence=True)
@@ -311,7 +302,7 @@ def _cells(rows: list[Row], data_level: float | None, scored: bool) -> list[list
     if unevaluated:
         heading = [name for name in DIAGNOSTICS if any(name in row.diagnostics for row in rows)]
     lines = [["agent", "set", *heading, "seeds", "updates", "s per 1000 updates"]]
-    for row in sorted(rows, key=lambda row: -row.mean):
+    for row in sorted(rows, key=lambda row: (np.isnan(row.mean), -row.mean)):
         changed = ", ".join(f"{name}={value}" for name, value in row.overrides.items())
         values = ["-" if np.isnan(value) else f"{value:.1f}" for value in (row.mean, row.std)]
         if unevaluated:

@@ -338,7 +338,7 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
     def coefficients_hold_until(self, n_updates: int) -> int:
         if callable(self.learning_rate):
             return n_updates + 1
-        every = self.beta_update_every * self.steps_per_epoch
+        every = self._beta_schedule().every
         return (n_updates // every + 1) * every
 
     def derived_metrics(self, means: dict[str, float]) -> dict[str, float]:

@@ -14,8 +14,8 @@ from rich.table import Table
 
 from sb3_dce.data import load_transitions
 from sb3_dce.data.catalog import normalized_score, resolve
-from sb3_dce.envs import dataset_spaces
-from sb3_dce.errors import ConfigError
+from sb3_dce.envs import dataset_spaces, missing_simulator
+from sb3_dce.errors import CheckpointError, ConfigError
 from sb3_dce.evaluation import read_evaluations
 from sb3_dce.execution import choose_execution
 from sb3_dce.files import quoted, write_text
@@ -23,7 +23,7 @@ from sb3_dce.launch import launch
 from sb3_dce.plots import plot_learning_curves
 from sb3_dce.processes import usable_cores
 from sb3_dce.rollouts import Rollouts, make_rollouts
-from sb3_dce.run_files import RunSpec
+from sb3_dce.run_files import RunSpec, read_config
 from sb3_dce.runs import alone
 
 DATASET = "halfcheetah-demo-sb3"
@@ -59,15 +59,18 @@ def run_demo(folder: Path, n_seeds: int, fresh: bool, console: Console) -> dict[
     :param fresh: delete earlier results in the folder first
     :param console: where to print
     :return: the table, by agent
+    :raises ConfigError: if the simulator is not installed
     """
+    missing = missing_simulator(resolve(DATASET))
+    if missing is not None:
+        raise ConfigError(missing.reason, key=missing.package, hint=missing.remedy)
     if fresh and folder.exists():
         _delete_demo(folder)
     transitions = load_transitions(DATASET)
     for line in transitions.summary():
         console.print(line, markup=False)
     rollouts = make_rollouts(DATASET, N_EVAL_EPISODES)
-    if rollouts is None:
-        raise ConfigError("the demo evaluates in MuJoCo, which is not installed", key="mujoco", hint="pip install mujoco")
+    assert rollouts is not None
     if choose_execution("auto", N_UPDATES, th.device("cpu")) == "eager":
         n_seeds = 1
         console.print("No C++ compiler, or no Python.h: updates run uncompiled, four times slower, so with one seed only.")
@@ -104,7 +107,7 @@ def run_demo(folder: Path, n_seeds: int, fresh: bool, console: Console) -> dict[
 def _delete_demo(folder: Path) -> None:
     """Delete what a demo wrote, and nothing else that may lie in the folder."""
     for path in folder.iterdir():
-        if path.is_dir() and path.name.startswith(("dce_", "offline_bc_")):
+        if _is_run_of_demo(path):
             with alone(path):
                 for inner in path.iterdir():
                     if inner.name == ".lock":  # it is open, which some systems do not let one delete
@@ -113,6 +116,17 @@ def _delete_demo(folder: Path) -> None:
             shutil.rmtree(path, ignore_errors=True)
         elif path.name in ("results.json", "learning_curve.png"):
             path.unlink()
+
+
+def _is_run_of_demo(path: Path) -> bool:
+    """By what is recorded there: the name alone may be that of a folder of the user's own."""
+    try:
+        config = read_config(path)
+    except CheckpointError:
+        return False
+    run = {} if config is None else config["run"]
+    is_ours = run.get("dataset") == DATASET and run.get("algo") in ("dce", "offline_bc")
+    return is_ours and path.name == f"{run['algo']}_{run.get('seed')}"
 
 
 def _random_returns(rollouts: Rollouts) -> list[float]:
@@ -132,7 +146,7 @@ def _seconds(results: list[dict[str, Any]], algo: str) -> float:
 
 def _print_table(table: dict[str, list[float]], seconds: dict[str, float], n_seeds: int, console: Console) -> None:
     view = Table(box=None, header_style="bold")
-    for title in ("agent", "return", "normalised score", "over", "train s"):
+    for title in ("agent", "return", "normalised score", "over", "train + eval s"):
         view.add_column(title, justify="left" if title in ("agent", "over") else "right")
     over = {"random": f"{N_EVAL_EPISODES} episodes", "data": f"{len(table['data'])} episodes of the data"}
     for name, values in table.items():

@@ -83,9 +83,7 @@ class Rewind(NamedTuple):
         """
         if model.num_timesteps != self.num_timesteps:  # within learn(), whose schedules follow the timesteps
             at = self.num_timesteps + model._n_updates - self.n_updates
-            model._update_current_progress_remaining(
-                max(self.num_timesteps, at - at % model.gradient_steps), model._total_timesteps
-            )
+            model._update_current_progress_remaining(model._chunk_around(at)[0], model._total_timesteps)
         model.train(1, self.batch_size)
         return not_finite(self.engine.metrics.read())
 

@@ -28,7 +28,7 @@ from sb3_dce.data.catalog import DatasetSpec
 from sb3_dce.data.file_checks import HDF5_SIGNATURE
 from sb3_dce.data.hdf5 import D4RLFile
 from sb3_dce.data.locate import is_path, known_dataset
-from sb3_dce.data.minari import environment_spec, find_minari, folder_of, is_minari_name
+from sb3_dce.data.minari import environment_spec, find_minari, is_minari
 from sb3_dce.errors import ConfigError
 from sb3_dce.files import expanded
 from sb3_dce.robotics import KITCHEN_ROBOT_NOISE_RATIO, KitchenObservation, fix_adroit, fix_kitchen_joint_types, kitchen_tasks
@@ -171,7 +171,7 @@ def own_env(name_or_path: str) -> gym.Env | None:
     :param name_or_path: file or folder, or ``minari:`` and an id of Minari
     :return: an environment that can be stepped, or ``None``
     """
-    if is_minari_name(name_or_path) or folder_of(name_or_path) is not None:
+    if is_minari(name_or_path):
         return make_minari_env(name_or_path)
     path = expanded(name_or_path)
     return make_recorded_env(path) if os.path.isfile(path) else None
@@ -179,8 +179,9 @@ def own_env(name_or_path: str) -> gym.Env | None:
 
 def make_minari_env(name: str) -> gym.Env | None:
     """
-    Environment of a dataset of Minari: the one that Gymnasium itself knows by the id in the metadata. They may also name
-    code, arguments and wrappers; nothing of this is used, and where it differs from Gymnasium's own entry there is none.
+    Environment of a dataset of Minari: the one that Gymnasium itself knows by the id in the metadata, with the time limit in
+    them. They may also name code, which is not looked at, and arguments and wrappers: where these differ from Gymnasium's
+    own entry there is none.
 
     :param name: ``minari:`` and an id of Minari, or a path of such a dataset
     :return: an environment that can be stepped, or ``None``
@@ -201,7 +202,7 @@ def make_minari_env(name: str) -> gym.Env | None:
     except (gym.error.Error, ImportError):  # its simulator is not installed
         return None
     assert isinstance(env, gym.Env)
-    return env
+    return _with_time_limit(env, recorded.get("max_episode_steps"))
 
 
 def make_env(env_id: str) -> gym.Env:
@@ -273,9 +274,7 @@ def make_recorded_env(path: str | PathLike[str]) -> gym.Env | None:
         env = make_env(env_id)
     except ConfigError:
         return None
-    limit, (below, own_limit) = attributes.get("max_episode_steps"), without_bookkeeping(env)
-    if isinstance(limit, int | np.integer) and limit > 0 and limit != own_limit:
-        env = TimeLimit(below, int(limit))
+    env = _with_time_limit(env, attributes.get("max_episode_steps"))
     both = (env.observation_space, env.action_space)
     fits = all(isinstance(space, spaces.Box) for space in both) and [int(np.prod(s.shape or ())) for s in both] == widths
     return env if fits else None
@@ -320,6 +319,14 @@ def without_bookkeeping(env: gym.Env) -> tuple[gym.Env, int | None]:
             limit = min(limit or env._max_episode_steps, env._max_episode_steps)
         env = env.env
     return env, limit
+
+
+def _with_time_limit(env: gym.Env, recorded: Any) -> gym.Env:
+    """The environment with the time limit of the recording, steps; with its own one if none is recorded."""
+    below, own_limit = without_bookkeeping(env)
+    if isinstance(recorded, int | np.integer) and recorded > 0 and recorded != own_limit:
+        return TimeLimit(below, int(recorded))
+    return env
 
 
 def dataset_spaces(spec: DatasetSpec) -> tuple[spaces.Box, spaces.Box]:

@@ -14,15 +14,12 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_dce.checks import LAST_SEED, check_number
+from sb3_dce.checks import LAST_SEED, SEEDS_PER_EVALUATION, check_number
 from sb3_dce.data.catalog import normalized_score, resolve
-from sb3_dce.errors import CheckpointError
+from sb3_dce.errors import CheckpointError, ConfigError
 from sb3_dce.evaluation_pool import EvaluationPool
-from sb3_dce.files import check_writable, write_atomically, write_text
+from sb3_dce.files import cannot_read, check_writable, write_atomically, write_text
 from sb3_dce.rollouts import Rollouts, deterministic_act
-
-# Seeds of two evaluations must not overlap; no evaluation has more episodes than this.
-SEEDS_PER_EVALUATION = 10_000
 
 
 @dataclass(frozen=True)
@@ -98,12 +95,12 @@ class EvaluationCallback(BaseCallback):
     :param dataset_id: defines the score
     :param eval_freq: gradient steps between two evaluations
     :param seed: seed of the run
-    :param folder: where the files are written; earlier evaluations found there are kept
+    :param folder: where the files are written; evaluations of fewer updates that are found there are kept
     :param on_evaluation: called with each outcome
     :param save_checkpoint: write ``checkpoint.zip`` after each evaluation
     :param n_workers: processes among which the episodes of an evaluation are divided; 0 plays them in this process. The
         returns are the same for a model on the CPU with one thread (workers compute there, with one thread). Scripts with
-        workers train below ``if __name__ == "__main__":``. The workers end with the training
+        workers train below ``if __name__ == "__main__":``. The workers end with the training, also with one that fails
     :raises ConfigError: if a number is out of range
     """
 
@@ -135,6 +132,8 @@ class EvaluationCallback(BaseCallback):
             check_writable(self.folder / "evaluations.npz")  # not hours later
         if self.rollouts is not None:
             self.rollouts.check_fits(self.model)
+            self.pool.check_can_make(self.model, self.rollouts)
+            self._refuse_other_numbers_of_episodes(self.rollouts.n_episodes)
 
     def _on_step(self) -> bool:
         if self.num_timesteps % self.eval_freq == 0:
@@ -146,6 +145,23 @@ class EvaluationCallback(BaseCallback):
 
     def _on_training_end(self) -> None:
         self.pool.close()
+
+    def on_training_failed(self) -> None:
+        """End the workers after an error, too; the next evaluation starts others."""
+        self.pool.close()
+
+    def _refuse_other_numbers_of_episodes(self, n_episodes: int) -> None:
+        """The arrays of ``evaluations.npz`` have one row per evaluation, all of one length."""
+        first = int(getattr(self.model, "_n_updates", 0)) + self.eval_freq - self.num_timesteps % self.eval_freq
+        kept = {len(e.returns) for e in self.evaluations if e.n_updates < first}
+        if self.folder is not None and not kept <= {n_episodes}:
+            raise ConfigError(
+                f"the folder has evaluations with n_eval_episodes={max(kept - {n_episodes})}, these would have {n_episodes}",
+                where=str(self.folder),
+                path=self.folder,
+                key="n_eval_episodes",
+                hint="Take as many, or another folder.",
+            )
 
     def _evaluate(self, rollouts: Rollouts) -> None:
         seed = evaluation_seed(self.seed, self.num_timesteps // self.eval_freq)
@@ -196,15 +212,17 @@ def read_evaluations(folder: Path, dataset_id: str | None) -> list[Evaluation]:
     :param folder: folder of a run
     :param dataset_id: defines the score
     :return: its evaluations so far
-    :raises CheckpointError: if the file is damaged
+    :raises CheckpointError: if the file is damaged or cannot be read
     """
     path = folder / "evaluations.npz"
-    if not path.is_file():
-        return []
     try:
         with np.load(path, allow_pickle=False) as data:
             rows = list(zip(data["timesteps"], data["results"], data["ep_lengths"], strict=True))
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    except OSError as error:
+        raise cannot_read(path, error) from error
+    except (EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
         hint = "Delete the folder; the same command trains the run again."
         raise CheckpointError("the file is damaged", where=str(path), path=path, hint=hint) from error
     return [Evaluation(int(n), tuple(map(float, r)), tuple(map(int, e)), dataset_id) for n, r, e in rows]

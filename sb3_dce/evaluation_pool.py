@@ -92,6 +92,21 @@ class EvaluationPool:
         self.n_workers = n_workers
         self._executor: ProcessPoolExecutor | None = None
 
+    def check_can_make(self, model: Any, rollouts: Rollouts) -> None:
+        """
+        Refuse environments that only this process can make, unless the model is evaluated in this process anyway.
+
+        :param model: agent
+        :param rollouts: environments
+        :raises ConfigError: if other processes would have to make them
+        """
+        if self.n_workers and rollouts.dataset is None and _payload(model) is not None:
+            raise ConfigError(
+                "only environments that are known by a dataset's name can be made in worker processes",
+                key="n_workers",
+                hint="Use n_workers=0, or environments from sb3_dce.rollouts.rollouts_of.",
+            )
+
     def submit(self, model: Any, rollouts: Rollouts, seed: int, parts: int = 1) -> PendingEpisodes:
         """
         Evaluate a policy as it is now; it may be trained on at once.
@@ -105,17 +120,13 @@ class EvaluationPool:
         :return: the episodes
         :raises ConfigError: if other processes cannot make these environments
         """
+        self.check_can_make(model, rollouts)
         payload = _payload(model) if self.n_workers else None
         if payload is None:
             here: Future[list[Ending]] = Future()
             here.set_result(rollouts.play_rows(deterministic_act(model), seed, range(rollouts.n_envs)))
             return PendingEpisodes([here])
-        if rollouts.dataset is None:
-            raise ConfigError(
-                "only environments that are known by a dataset's name can be made in worker processes",
-                key="n_workers",
-                hint="Use n_workers=0, or environments from sb3_dce.rollouts.rollouts_of.",
-            )
+        assert rollouts.dataset is not None
         recipe = (rollouts.dataset, rollouts.n_episodes, rollouts.n_envs)
         parts = max(1, min(parts, self.n_workers, rollouts.n_envs))
         shares = [range(k, rollouts.n_envs, parts) for k in range(parts)]

@@ -23,10 +23,11 @@ def write_atomically(target: pathlib.Path) -> Iterator[BinaryIO]:
     """
     A binary stream whose content appears under its name at once and whole, or not at all.
 
-    :param target: file to write; missing folders are created
+    :param target: file to write, or a link to it; missing folders are created
     :raises CheckpointError: if it cannot be written; a file that was there is untouched
     """
     temporary: str | None = None
+    target = _followed(target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         _remove_abandoned(target)
@@ -45,6 +46,11 @@ def write_atomically(target: pathlib.Path) -> Iterator[BinaryIO]:
     finally:
         if temporary is not None and os.path.exists(temporary):
             os.unlink(temporary)
+
+
+def _followed(target: pathlib.Path) -> pathlib.Path:
+    """The file that a link leads to, there or not: replaced by a new file it would be a link no more."""
+    return pathlib.Path(os.path.realpath(target)) if os.path.islink(target) else target
 
 
 def exists(path: str | PathLike[str]) -> bool:
@@ -153,10 +159,11 @@ def check_writable(target: pathlib.Path) -> None:
     :param target: file to be written later; missing folders are created
     :raises CheckpointError: if it is a folder, or its folder cannot be made or written
     """
-    if target.is_dir():
-        hint = f"Name a file, for example {target / 'results.md'}."
-        raise CheckpointError("a folder is no file to write", where=str(target), path=target, hint=hint)
+    target = _followed(target)
     try:
+        if target.is_dir():
+            hint = "Name a file in it, or rename the folder."
+            raise CheckpointError("a folder is no file to write", where=str(target), path=target, hint=hint)
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=target.parent):
             pass
@@ -178,6 +185,18 @@ def cannot_write(target: pathlib.Path, error: OSError) -> CheckpointError:
         path=target,
         hint="Check the folder's permissions and the free space, or choose another path.",
     )
+
+
+def cannot_read(path: pathlib.Path, error: OSError) -> CheckpointError:
+    """
+    The package's error for a file of a run that the system does not give; nothing says that it is damaged.
+
+    :param path: file
+    :param error: why it was not read
+    :return: the error in words, for the caller to raise
+    """
+    hint = "Check the permissions of the run's folder and its disk; the same command goes on then."
+    return CheckpointError(f"the file cannot be read: {error.strerror or error}", where=str(path), path=path, hint=hint)
 
 
 def _umask() -> int:

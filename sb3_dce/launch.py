@@ -8,8 +8,9 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -104,40 +105,48 @@ class _Workers:
 
         :param spec: what is to be run
         :return: its result
-        :raises RunFailedError: if no process can be started, or it is killed; the next run of this thread gets a new one
+        :raises RunFailedError: if no process can be started, or it is killed
+        :raises BaseException: what ``report`` raises; then, too, the next run of this thread gets a new process
         """
         try:
-            end = self._end_of_own_process()
-            end.send(spec)
-            while isinstance(message := end.recv(), runs.Progress):
+            end = self._end_of_own_process(spec.name)
+            with _death_in_words(spec.name):
+                end.send(spec)
+                message = end.recv()
+            while isinstance(message, runs.Progress):
                 self._report(message)
-        except (EOFError, ConnectionError) as error:
-            self._own.end = None
-            raise RunFailedError(
-                f"the process of {spec.name} was ended from outside, as the system does when memory is short",
-                hint="Use fewer --workers; the same command goes on from the last checkpoint. A script that starts processes "
-                'must do so below if __name__ == "__main__":.',
-            ) from error
-        except OSError as error:
-            hint = "Use fewer --workers; the same command goes on."
-            raise RunFailedError(f"no process for {spec.name}: {error.strerror or error}", hint=hint) from error
+                with _death_in_words(spec.name):
+                    message = end.recv()
+        except BaseException:
+            self._kill_own_process()  # what it still sends would be taken for messages of the next run
+            raise
         if isinstance(message, BaseException):
             raise message
         return message
 
-    def _end_of_own_process(self) -> Connection:
-        if getattr(self._own, "end", None) is None:
+    def _end_of_own_process(self, name: str) -> Connection:
+        if getattr(self._own, "process", None) is None:
             with self._lock:
                 if self._ended:
                     raise CancelledError
-                here, there = self._context.Pipe()
-                with there:  # the process has it then, and with the process it closes
-                    process = self._context.Process(target=_serve, args=(there, self._threads, self._stop))
-                    process.start()
+                try:
+                    here, there = self._context.Pipe()
+                    with there:  # the process has it then, and with the process it closes
+                        process = self._context.Process(target=_serve, args=(there, self._threads, self._stop))
+                        process.start()
+                except OSError as error:
+                    hint = "Use fewer --workers; the same command goes on."
+                    raise RunFailedError(f"no process for {name}: {error.strerror or error}", hint=hint) from error
                 self._processes.append(process)
                 self._ends.append(here)
-                self._own.end = here
+                self._own.process, self._own.end = process, here
         return self._own.end
+
+    def _kill_own_process(self) -> None:
+        process, self._own.process = getattr(self._own, "process", None), None
+        if process is not None:
+            process.kill()  # they do not listen to SIGTERM
+            process.join()
 
     def save_and_end(self) -> None:
         """Tell all runs to save where they are, and to end."""
@@ -152,12 +161,25 @@ class _Workers:
         with self._lock:
             self._ended = True
         for process in self._processes if at_once else ():
-            process.kill()  # they do not listen to SIGTERM
+            process.kill()
             process.join()  # before its pipe is closed, at which a thread may be waiting
         for end in self._ends:
             end.close()
         for process in self._processes:
             process.join()
+
+
+@contextmanager
+def _death_in_words(name: str) -> Iterator[None]:
+    """The end of a process while it is sent a run or heard, also in the middle of a message."""
+    try:
+        yield
+    except (EOFError, OSError) as error:
+        raise RunFailedError(
+            f"the process of {name} was ended from outside, as the system does when memory is short",
+            hint="Use fewer --workers; the same command goes on from the last checkpoint. A script that starts processes "
+            'must do so below if __name__ == "__main__":.',
+        ) from error
 
 
 def _launch(specs: Sequence[RunSpec], n_workers: int, console: Console, keep_going: bool) -> list[Future[Any]]:

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import torch as th
 
+from sb3_dce.checks import check_choice
+
 
 @dataclass(frozen=True)
 class NoiseSpec:
@@ -15,11 +17,15 @@ class NoiseSpec:
     :param kind: "normal", "uniform" in [0, 1), or "dropout" (0 with probability ``rate``, else 1 / (1 - rate))
     :param shape: shape of the tensor
     :param rate: dropout rate
+    :raises ConfigError: if the kind is none of these
     """
 
     kind: str
     shape: tuple[int, ...]
     rate: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_choice("kind", self.kind, ("normal", "uniform", "dropout"))
 
     def draw(self, generator: th.Generator, device: th.device, dtype: th.dtype) -> th.Tensor:
         """

@@ -205,12 +205,13 @@ class MLPPolicy(NumpyPolicy):
             x = x @ weight
             x += bias
             x = activation(x)
-        if not (with_std and self._has_std_layer):
-            mean = x @ self._mean[0] + self._mean[1]
-            return np.tanh(mean) if self.squash == "mean" else mean, self._std if with_std else None
-        both = x @ self._both[0] + self._both[1]
-        log_std = np.minimum(np.maximum(both[:, self.act_dim :], LOG_STD_MIN), LOG_STD_MAX)
-        return both[:, : self.act_dim], np.exp(log_std)
+        if with_std and self._has_std_layer:
+            both = x @ self._both[0] + self._both[1]
+            log_std = np.minimum(np.maximum(both[:, self.act_dim :], LOG_STD_MIN), LOG_STD_MAX)
+            mean, std = both[:, : self.act_dim], np.exp(log_std)
+        else:
+            mean, std = x @ self._mean[0] + self._mean[1], self._std if with_std else None
+        return np.tanh(mean) if self.squash == "mean" else mean, std
 
 
 class RandomPolicy(NumpyPolicy):

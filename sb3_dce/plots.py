@@ -29,14 +29,16 @@ def plot_learning_curves(
     """
     Normalised score (or return, without reference scores) against gradient steps: mean over seeds, each seed thin.
 
-    :param curves: per agent, per seed, the evaluations
+    :param curves: per agent, per seed, the evaluations; a seed without any is left out
     :param path: picture to write
     :param title: heading
     :param levels: horizontal lines in the same units, by name
     :param confidence: shade the 95 % confidence interval of the mean (Student's t) from three seeds on, instead of the range
     :return: ``path``, or ``None`` without matplotlib or without any evaluation
     """
-    if not any(seed for seeds in curves.values() for seed in seeds):
+    # the mean goes as far as the shortest
+    curves = {name: evaluated for name, seeds in curves.items() if (evaluated := [seed for seed in seeds if seed])}
+    if not curves:
         return None
     try:
         from matplotlib.figure import Figure

@@ -32,7 +32,7 @@ class OfflineSACPolicy(SACPolicy):
     :param activation_fn: activation of the hidden layers
     :param features_extractor_class: network applied to the observations first; each network has its own copy
     :param features_extractor_kwargs: its keyword arguments
-    :param normalize_images: divide image observations by 255
+    :param normalize_images: kept for Stable-Baselines3's interface; observations are never divided by 255
     :param optimizer_class: ``torch.optim.Adam`` or ``torch.optim.AdamW``
     :param optimizer_kwargs: its keyword arguments, learning rate excluded
     :param n_critics: number of critics

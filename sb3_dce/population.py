@@ -13,6 +13,7 @@ import copy
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from itertools import zip_longest
 from typing import Any
 
 import torch as th
@@ -311,11 +312,15 @@ def check_alike(models: Sequence[OfflineAlgorithm]) -> None:
         else:
             mine, other = first.hyperparameters(), model.hyperparameters()
             found = [name for name in mine if name not in allowed and mine[name] != other[name]]
+            kinds = [[type(module) for module in m.policy.modules()] for m in (first, model)]
             shapes = [[p.shape for p in m.policy.parameters()] for m in (first, model)]
             names = [set(m.make_storages()) for m in (first, model)]
             frozen = [[n for n, p in m.policy.named_parameters() if not p.requires_grad] for m in (first, model)]
             if found:
                 differing, theirs, ours = found[0], other[found[0]], mine[found[0]]
+            elif kinds[0] != kinds[1]:  # the update is made from the networks of member 0
+                ours, theirs = next(pair for pair in zip_longest(*kinds) if pair[0] is not pair[1])
+                differing = "policy"
             elif shapes[0] != shapes[1]:
                 differing, theirs, ours = "network shapes", model.observation_space, first.observation_space
             elif frozen[0] != frozen[1]:

@@ -32,7 +32,16 @@ from sb3_dce.launch import launch, progress_display, show_evaluation
 from sb3_dce.population import Population
 from sb3_dce.processes import termination_as_interrupt, usable_cores
 from sb3_dce.rollouts import Rollouts, rollouts_of
-from sb3_dce.run_files import RunSpec, make_logger, read_divergence, read_result, write_config, write_divergence, write_result
+from sb3_dce.run_files import (
+    RunSpec,
+    forget_logs_after,
+    make_logger,
+    read_divergence,
+    read_result,
+    write_config,
+    write_divergence,
+    write_result,
+)
 from sb3_dce.runs import alone, refuse_other_run
 
 # Beside the members' folders: how far all have come, and the state of the common random generator.
@@ -62,7 +71,7 @@ def train_population(
     :param state_file: name of the file in the common folder that says how far the population is; two populations with
         folders of their own in one common folder need two names
     :return: results in the order of ``specs``
-    :raises ConfigError: if the runs cannot be trained together
+    :raises ConfigError: if the runs cannot be trained together, or one was interrupted as a run of its own
     :raises SB3DCEError: if something is wrong with data, parameters or files
     """
     console = console or Console(quiet=True)
@@ -125,7 +134,8 @@ class BatchedRuns:
         self._device, self._execution, self._own_randomness = device, execution, own_randomness
         self._rollouts: dict[str | None, Rollouts | None] = {}
         self._diverged: dict[int, int] = {}
-        self._loggers: list[Logger] = []
+        self._ended: dict[int, int] = {}
+        self._loggers: dict[int, Logger] = {}
         self._seconds_before = 0.0
 
     def run(self) -> list[dict[str, Any]]:
@@ -134,19 +144,30 @@ class BatchedRuns:
 
         :return: results in the order of the specifications
         :raises DivergenceError: if members have diverged, now or in an earlier call; the others are complete
+        :raises CheckpointError: if another process is at one of the runs, or a file is damaged
+        :raises ConfigError: if the runs cannot be trained together, or one was interrupted as a run of its own
         """
-        done = [read_result(folder) for folder in self.folders]
-        ended = [read_divergence(folder) for folder in self.folders]
-        if all(e is not None or (d is not None and d["n_updates"] == self.total) for d, e in zip(done, ended, strict=True)):
-            self._remove_state()  # a kill may have left it
-            self._refuse_diverged({index: int(e["n_updates"]) for index, e in enumerate(ended) if e is not None})
-            return [result for result in done if result is not None]
+        results = self._complete_results()
+        if results is not None:
+            return results
         with self._pool, ExitStack() as stack:
-            population = self._population()
             for folder in self.folders:
-                folder.mkdir(parents=True, exist_ok=True)
                 stack.enter_context(alone(folder))
-            return self._run(population)
+            for spec, folder in zip(self.specs, self.folders, strict=True):
+                refuse_other_run(spec, folder)  # another process may have been at it meanwhile
+            results = self._complete_results()
+            return self._run(self._population()) if results is None else results
+
+    def _complete_results(self) -> list[dict[str, Any]] | None:
+        """Results of all members, ``None`` if one is left to train; the error, if none is left and some have diverged."""
+        done = [read_result(folder) for folder in self.folders]
+        ended = {index: read_divergence(folder) for index, folder in enumerate(self.folders)}
+        self._ended = {index: int(divergence["n_updates"]) for index, divergence in ended.items() if divergence is not None}
+        if any(d is None or d["n_updates"] != self.total for index, d in enumerate(done) if index not in self._ended):
+            return None
+        self._remove_state()  # a kill may have left it
+        self._refuse_diverged(self._ended)
+        return [result for result in done if result is not None]
 
     def _run(self, population: Population) -> list[dict[str, Any]]:
         self._say_memory(population)
@@ -188,7 +209,9 @@ class BatchedRuns:
     def _population(self) -> Population:
         agent, state = agent_class(self.specs[0].algo), self._state_path
         saved = self._saved_state()
-        self._diverged = {} if saved is None else dict(saved.get("diverged", {}))
+        if saved is None:
+            self._refuse_begun_alone()
+        self._diverged = {**({} if saved is None else saved.get("diverged", {})), **self._ended}
         models: list[OfflineAlgorithm] = []
         for index, (spec, folder) in enumerate(zip(self.specs, self.folders, strict=True)):
             if saved is None or index in self._diverged:
@@ -207,11 +230,24 @@ class BatchedRuns:
                 )
             population.set_random_state(saved["random_state"])
             self._seconds_before = saved["seconds"]
-        for spec, model, folder in zip(self.specs, models, self.folders, strict=True):
-            folder.mkdir(parents=True, exist_ok=True)
-            write_config(spec, model, folder, self._device, len(models))
-            self._loggers.append(make_logger(spec, model, folder))
+        for index, (spec, model, folder) in enumerate(zip(self.specs, models, self.folders, strict=True)):
+            if index not in self._ended:  # the files of one that diverged in an earlier call stay as they are
+                write_config(spec, model, folder, self._device, len(models))
+                _forget_after(folder, model.num_timesteps, catalogue_id(model.dataset))
+                self._loggers[index] = make_logger(spec, model, folder)
         return population
+
+    def _refuse_begun_alone(self) -> None:
+        """Nothing would go on from these checkpoints, and what they hold would be trained anew."""
+        members = [folder for index, folder in enumerate(self.folders) if index not in self._ended]
+        begun = [folder.name for folder in members if (folder / "checkpoint.zip").is_file()]
+        if begun:
+            raise ConfigError(
+                f"interrupted as runs of their own, which a population does not go on with: {', '.join(begun)}",
+                where=str(self.common),
+                key="folder",
+                hint="Finish them with sb3_dce.runs.run, or delete their checkpoint.zip to begin anew.",
+            )
 
     def _saved_state(self) -> dict[str, Any] | None:
         """Where these runs were interrupted, ``None`` if there is nothing to go on with."""
@@ -239,7 +275,9 @@ class BatchedRuns:
     # -- at every evaluation ---------------------------------------------------------------------------------------
 
     def _log_metrics(self, population: Population) -> None:
-        for index, (metrics, logger) in enumerate(zip(population.read_metrics(), self._loggers, strict=True)):
+        members = population.read_metrics()
+        for index, logger in self._loggers.items():
+            metrics = members[index]
             for name, value in metrics.items():
                 logger.record(f"train/{name}", value)
             # a row of the file says where it belongs
@@ -279,12 +317,13 @@ class BatchedRuns:
         self._evaluate(population.models, n, [index for index, updates in enumerate(seen) if n not in updates])
 
     def _collect_evaluations(self) -> None:
-        pending, self._pending = self._pending, []
-        for index, n_updates, dataset_id, episodes in pending:
+        while self._pending:
+            index, n_updates, dataset_id, episodes = self._pending[0]
             folder = self.folders[index]
             outcome = Evaluation(n_updates, *episodes.result(), dataset_id)
             earlier = [e for e in read_evaluations(folder, dataset_id) if e.n_updates < n_updates]
             write_evaluations(folder, [*earlier, outcome])
+            self._pending.pop(0)  # not before: after an interruption while it is waited for, it is asked for again
             show_evaluation(self.console, self.specs[index].name, outcome)
 
     def _save(self, population: Population, seconds: float) -> None:
@@ -319,8 +358,10 @@ class BatchedRuns:
         for index, (spec, model, folder) in enumerate(zip(self.specs, population.models, self.folders, strict=True)):
             if index not in self._diverged and self._save_member(index, model, folder / "model.zip", self.total):
                 results.append(write_result(spec, folder, read_evaluations(folder, catalogue_id(model.dataset)), seconds))
+                (folder / "checkpoint.zip").unlink(missing_ok=True)  # of a run of its own: a longer one would go on from it
         for index, n in self._diverged.items():
-            write_divergence(self.folders[index], n, "metrics not finite")
+            if index not in self._ended:
+                write_divergence(self.folders[index], n, "metrics not finite")
         self._remove_state()  # not before all is said: a kill in between goes on from it
         self._refuse_diverged(self._diverged)
         return results
@@ -357,6 +398,15 @@ def members_to_go_on(state_file: Path) -> list[Path]:
         return []
     whole = all(i in diverged or (folder / _checkpoint(n_updates)).is_file() for i, folder in enumerate(folders))
     return folders if whole else []
+
+
+def _forget_after(folder: Path, n_updates: int, dataset_id: str | None) -> None:
+    """Delete what tells of updates that are made anew: it would pass for that of the run which begins here."""
+    forget_logs_after(folder, n_updates)
+    evaluations = read_evaluations(folder, dataset_id)
+    kept = [e for e in evaluations if e.n_updates <= n_updates]
+    if kept != evaluations:
+        write_evaluations(folder, kept)
 
 
 def _checkpoint(n_updates: int) -> str:

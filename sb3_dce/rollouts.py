@@ -17,7 +17,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_dce.checks import check_number
+from sb3_dce.checks import SEEDS_PER_EVALUATION, check_number, check_optional
 from sb3_dce.data.catalog import resolve
 from sb3_dce.data.locate import catalogue_id, is_path
 from sb3_dce.data.minari import is_minari_name
@@ -83,7 +83,7 @@ class Rollouts:
     :param n_episodes: episodes of an evaluation
     :param n_envs: environments; default: as many as episodes
     :param dataset: id or name from which :func:`~sb3_dce.rollouts.rollouts_of` makes the same in another process
-    :raises ConfigError: if a number is below 1
+    :raises ConfigError: if a number is below 1, or there would be more than 10,000 environments, each with a seed of its own
     """
 
     def __init__(
@@ -93,8 +93,10 @@ class Rollouts:
         n_envs: int | None = None,
         dataset: str | None = None,
     ) -> None:
-        check_number("n_eval_episodes", n_episodes, 1, integer=True, hint="Usual are 10.")
-        check_number("n_envs", 1 if n_envs is None else n_envs, 1, integer=True, hint="Leave it out.")
+        most = SEEDS_PER_EVALUATION if n_envs is None else float("inf")
+        hint = f"Usual are 10; for more than {SEEDS_PER_EVALUATION:,} give n_envs."
+        check_number("n_eval_episodes", n_episodes, 1, most, integer=True, hint=hint)
+        check_optional("n_envs", n_envs, 1, high=SEEDS_PER_EVALUATION, integer=True, hint="Leave it out.")
         self.n_episodes, self.n_envs, self.dataset = n_episodes, n_envs or n_episodes, dataset
         self._make_env = make_env
         self._envs: dict[int, gym.Env] = {}

@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import hashlib
 import json
+import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -33,7 +36,7 @@ from sb3_dce.data.hashes import sha256_once
 from sb3_dce.data.locate import short_name
 from sb3_dce.errors import CheckpointError
 from sb3_dce.evaluation import Evaluation
-from sb3_dce.files import write_text
+from sb3_dce.files import cannot_read, write_text
 from sb3_dce.precision import missing_for
 
 BEGIN_ANEW = "Delete the run's folder to run it anew, or choose another one with --out."
@@ -77,7 +80,8 @@ def write_config(
     spec: RunSpec, model: OfflineAlgorithm, folder: Path, device: th.device | None = None, n_members: int = 1
 ) -> None:
     """
-    Write ``config.yml``: what is run, on which data, with which versions on what kind of machine.
+    Write ``config.yml``: what is run, on which data, with which versions on what kind of machine. Where a run goes on,
+    command, versions and machine of its beginning stay; ``resumed_with`` has what was another one, from which update on.
 
     :param spec: what is run
     :param model: its model, with the data attached
@@ -88,15 +92,12 @@ def write_config(
     assert model.dataset is not None
     path, known = find_file(model.dataset)
     # the row that it began with, whatever the file is called by now
-    before = (read_config(folder) or {}).get("dataset", {})
-    row = before.get("row", None if known is None else known.id)
+    before = read_config(folder) or {}
+    row = before.get("dataset", {}).get("row", None if known is None else known.id)
     device = device or model.device
     hyperparameters = {name: plain(value) for name, value in model.hyperparameters().items()}
-    config = {
-        "run": settings_of_run(spec),
+    origin = {
         "command": " ".join(["sb3-dce", *sys.argv[1:]]) if Path(sys.argv[0]).name == "sb3-dce" else None,
-        "dataset": {"name": model.dataset, "row": row, "sha256": sha256_once(path), **(model.dataset_statistics or {})},
-        "hyperparameters": hyperparameters,
         "versions": {
             "sb3_dce": sb3_dce.__version__,
             "commit": source_commit(),
@@ -111,7 +112,31 @@ def write_config(
             "threads": th.get_num_threads(),
         },
     }
+    config = {
+        "run": settings_of_run(spec),
+        "dataset": {"name": model.dataset, "row": row, "sha256": sha256_once(path), **(model.dataset_statistics or {})},
+        "hyperparameters": hyperparameters,
+        **(_origin_when_resumed(before, origin, model.num_timesteps) if model.num_timesteps else origin),
+    }
     write_text(folder / "config.yml", yaml.safe_dump(config, sort_keys=False))
+
+
+def _origin_when_resumed(before: dict[str, Any], now: dict[str, Any], n_updates: int) -> dict[str, Any]:
+    """Where the work before an update, which is kept, and the work after it come from."""
+    origin = {name: before.get(name, value) for name, value in now.items()}
+    # what was done by a start from here, or from later, is lost
+    resumed = [start for start in before.get("resumed_with", ()) if start["n_updates"] < n_updates]
+    last, new = _flat(origin), _flat(now)
+    for start in resumed:
+        last.update(start)
+    last.pop("n_updates", None)
+    changed = {name: new.get(name) for name in {**last, **new} if new.get(name) != last.get(name)}
+    resumed += [{"n_updates": n_updates, **changed}] if changed else []
+    return {**origin, **({"resumed_with": resumed} if resumed else {})}
+
+
+def _flat(origin: dict[str, Any]) -> dict[str, Any]:
+    return {"command": origin["command"], **origin["versions"], **origin["machine"]}
 
 
 def plain(value: Any) -> Any:
@@ -119,7 +144,8 @@ def plain(value: Any) -> Any:
     A setting in types that YAML gives back as they were, so that it can be compared with one in a ``config.yml``.
 
     :param value: of a hyperparameter
-    :return: numbers of NumPy as those of Python, tuples as lists; what YAML does not know becomes a text (its ``repr``)
+    :return: numbers of NumPy as those of Python, tuples as lists; what YAML does not know becomes a text, its ``repr`` without
+        the address, which each process has anew: functions are told apart by their names only
     """
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
@@ -127,7 +153,8 @@ def plain(value: Any) -> Any:
         return [plain(item) for item in value]
     if isinstance(value, np.generic):
         return value.item()
-    return value if value is None or isinstance(value, bool | int | float | str) else repr(value)
+    known = value is None or isinstance(value, bool | int | float | str)
+    return value if known else re.sub(" at 0x[0-9a-fA-F]+", "", repr(value))
 
 
 def read_config(folder: Path) -> dict[str, Any] | None:
@@ -164,11 +191,13 @@ def spec_from(settings: dict[str, Any], folder: Path) -> RunSpec:
 
 def _read(path: Path, parse: Callable[[str], Any], keys: Sequence[str] = ()) -> dict[str, Any] | None:
     """A file of a run, None if there is none."""
-    if not path.is_file():
-        return None
     try:
         content = parse(path.read_text(encoding="utf-8"))
-    except (ValueError, yaml.YAMLError, RecursionError, OSError) as error:
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise cannot_read(path, error) from error
+    except (ValueError, yaml.YAMLError, RecursionError) as error:
         raise CheckpointError("the file is damaged", where=str(path), path=path, hint=BEGIN_ANEW) from error
     complete = isinstance(content, dict) and all(key in content for key in keys)
     if not complete or ("n_updates" in keys and not isinstance(content["n_updates"], int)):
@@ -187,7 +216,7 @@ def write_result(spec: RunSpec, folder: Path, evaluations: list[Evaluation], sec
     :param spec: what was run
     :param folder: where it is written
     :param evaluations: all evaluations of the run; the last one counts
-    :param seconds: of training
+    :param seconds: wall time of training and evaluations
     :return: the result
     """
     last = evaluations[-1] if evaluations else None
@@ -240,7 +269,7 @@ def progress_logs(folder: Path) -> list[tuple[int, Path]]:
 
 def last_metrics(folder: Path) -> dict[str, float]:
     """
-    Diagnostics in the last row of the newest log that has a row.
+    Diagnostics in the last row of the logs that has some; one of an evaluation between two others has none.
 
     :param folder: of a run
     :return: values by name without ``train/``; empty if there are none
@@ -248,9 +277,10 @@ def last_metrics(folder: Path) -> dict[str, float]:
     for _, path in reversed(progress_logs(folder)):
         with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file))
-        if rows:
-            named = ((name.removeprefix("train/"), value) for name, value in rows[-1].items() if name.startswith("train/"))
-            return {name: float(value) for name, value in named if value}
+        for row in reversed(rows):
+            named = ((name.removeprefix("train/"), value) for name, value in row.items() if name.startswith("train/"))
+            if metrics := {name: float(value) for name, value in named if value}:
+                return metrics
     return {}
 
 
@@ -285,9 +315,9 @@ def settings_of_run(spec: RunSpec) -> dict[str, Any]:
     Settings that make a run this one and no other: neither its folder and label nor where it is run.
 
     :param spec: what is run
-    :return: value by field of :class:`RunSpec`, without ``folder``, ``label`` and ``device``
+    :return: value by field of :class:`RunSpec`, :func:`plain`, without ``folder``, ``label`` and ``device``
     """
-    return {key: value for key, value in asdict(spec).items() if key not in ("folder", "label", "device")}
+    return {key: plain(value) for key, value in asdict(spec).items() if key not in ("folder", "label", "device")}
 
 
 def make_logger(spec: RunSpec, model: OfflineAlgorithm, folder: Path) -> Logger:
@@ -297,11 +327,13 @@ def make_logger(spec: RunSpec, model: OfflineAlgorithm, folder: Path) -> Logger:
     :param spec: what is run
     :param model: its model, at the update from which it goes on
     :param folder: where it is written
-    :return: logger to that file and, if the model asks for it, to TensorBoard
+    :return: logger to that file and, if the model asks for it, to a TensorBoard folder that no other run has
     """
     formats = [make_output_format("csv", str(folder), f"_{model.num_timesteps}")]
     if model.tensorboard_log is not None:
-        name = f"{spec.algo}_{short_name(spec.dataset)}_{spec.seed}"
+        # runs with other settings are in other folders
+        place = hashlib.sha256(os.fsencode(folder.resolve())).hexdigest()[:6]
+        name = f"{spec.algo}_{short_name(spec.dataset)}_{spec.seed}_{place}"
         formats.append(make_output_format("tensorboard", str(Path(model.tensorboard_log) / name)))
     return Logger(str(folder), formats)
 
@@ -319,18 +351,21 @@ def forget_logs_after(folder: Path, n_updates: int) -> None:
             path.unlink()
 
 
-def seconds_before(folder: Path) -> float:
+def seconds_before(folder: Path, n_updates: int) -> float:
     """
-    Sum of the elapsed times at the ends of all logs there are, to which a run that goes on adds its own.
+    Seconds in the logs of the work that counts, to which a run that goes on adds its own.
 
     :param folder: of a run that goes on
-    :return: seconds of training before
+    :param n_updates: where it goes on; what was done beyond that, or beyond the beginning of a later log, is done again
+    :return: seconds of training and evaluations before, up to the last row of each log that has a time
     """
+    logs = progress_logs(folder)
+    ends = [*(first for first, _ in logs[1:]), n_updates]
     total = 0.0
-    for _, path in progress_logs(folder):
+    for (_, path), end in zip(logs, ends, strict=False):
         with path.open(newline="", encoding="utf-8") as file:
-            elapsed = [row.get("time/time_elapsed") for row in csv.DictReader(file)]
-        total += max((float(value) for value in elapsed if value), default=0.0)
+            rows = [(row.get("time/total_timesteps"), row.get("time/time_elapsed")) for row in csv.DictReader(file)]
+        total += max((float(elapsed) for at, elapsed in rows if at and elapsed and float(at) <= end), default=0.0)
     return total
 
 

@@ -13,7 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_dce.agents import agent_class
 from sb3_dce.base import OfflineAlgorithm
-from sb3_dce.checks import changed_settings
+from sb3_dce.checks import changed_settings, check_ends_with_evaluation
 from sb3_dce.configuration import NOT_HYPERPARAMETERS, settings_in_force
 from sb3_dce.data import find_file
 from sb3_dce.data.hashes import sha256_once
@@ -99,11 +99,7 @@ def run(spec: RunSpec, report: Report = lambda progress: None, stop: Callable[[]
     model = _model(spec, folder)
     model.check_frequency("eval_freq", spec.eval_freq)  # ``learn`` would, but when the folder is already that of this run
     model.attach_dataset()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)  # not before: a run that is refused leaves nothing behind
-    except OSError as error:
-        raise cannot_write(folder, error) from error
-    with alone(folder):
+    with alone(folder):  # not before: a run that is refused leaves nothing behind
         if _stage(folder) != seen:  # another process was at it meanwhile
             refuse_other_run(spec, folder)
             if (done := read_result(folder)) is not None and done["n_updates"] == spec.n_updates:
@@ -124,11 +120,13 @@ def alone(folder: Path) -> Iterator[None]:
     """
     Hold the lock of a run: two processes in one folder would mix their files.
 
-    :param folder: of the run, existing
+    :param folder: of the run; made if it is not there, and removed at the end if nothing was written
     :raises CheckpointError: if another process is at it, or the folder cannot be written
     """
     with ExitStack() as stack:
         try:
+            stack.callback(_remove_empty, [path for path in (folder, *folder.parents) if not path.exists()])
+            folder.mkdir(parents=True, exist_ok=True)
             stack.enter_context(held(folder / ".lock"))
         except BlockingIOError as error:
             hint = "Wait for it, or take another --out."
@@ -136,6 +134,12 @@ def alone(folder: Path) -> Iterator[None]:
         except OSError as error:
             raise cannot_write(folder / ".lock", error) from error
         yield
+
+
+def _remove_empty(folders: Sequence[Path]) -> None:
+    with suppress(OSError):  # of one that has files, and so of its parents
+        for folder in folders:
+            folder.rmdir()
 
 
 def _train(spec: RunSpec, model: OfflineAlgorithm, folder: Path, report: Report, stop: Callable[[], bool]) -> dict[str, Any]:
@@ -153,7 +157,7 @@ def _train(spec: RunSpec, model: OfflineAlgorithm, folder: Path, report: Report,
         rollouts, dataset_id, spec.eval_freq, spec.seed, folder, on_evaluation, save_checkpoint=True
     )
     evaluating.evaluations = [e for e in evaluating.evaluations if e.n_updates <= model.num_timesteps]
-    started, before = time.monotonic(), seconds_before(folder)
+    started, before = time.monotonic(), seconds_before(folder, model.num_timesteps)
     remaining, log_interval = spec.n_updates - model.num_timesteps, min(1000, spec.eval_freq)
     if remaining > 0:
         model.learn(
@@ -189,7 +193,7 @@ def refuse_other_run(spec: RunSpec, folder: Path) -> None:
     if config is None:
         return
     begun, data, settings = (config[name] for name in ("run", "dataset", "hyperparameters"))
-    wanted = plain(settings_of_run(spec))
+    wanted = settings_of_run(spec)
     del wanted["dataset"]
     if _reached(folder) <= spec.n_updates and not _depends_on_length(settings):
         del wanted["n_updates"]
@@ -241,8 +245,11 @@ def check_before_running(specs: Sequence[RunSpec]) -> None:
     Find what is wrong with any of many runs before the first of them takes hours.
 
     :param specs: what is to be run
-    :raises SB3DCEError: if a folder holds another run, or an agent cannot be made with its settings
+    :raises SB3DCEError: if a folder holds another run, an agent cannot be made with its settings, or the last updates of a run
+        come after its last evaluation
     """
+    for spec in specs:
+        _refuse_unseen_updates(spec)
     made: list[tuple[str, str, dict[str, Any]]] = []
     for spec in specs:
         folder = Path(spec.folder)
@@ -267,6 +274,13 @@ def check_before_running(specs: Sequence[RunSpec]) -> None:
                 where=spec.algo,
                 hint="Check policy_kwargs and what else was set.",
             ) from error
+
+
+def _refuse_unseen_updates(spec: RunSpec) -> None:
+    """A run of an earlier version may have been begun without this check; without a simulator there is no evaluation."""
+    begun = read_config(Path(spec.folder)) is not None
+    if spec.n_updates % spec.eval_freq and not begun and rollouts_of(spec.dataset, spec.n_eval_episodes) is not None:
+        check_ends_with_evaluation(spec.n_updates, spec.eval_freq, f" of {spec.algo}")
 
 
 def _model(spec: RunSpec, folder: Path) -> OfflineAlgorithm:

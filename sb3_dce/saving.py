@@ -107,7 +107,7 @@ class SavingMixin(OffPolicyAlgorithm):
         :param print_system_info: print versions of this machine and of the file
         :param force_reset: kept for Stable-Baselines3
         :param kwargs: constructor arguments that replace the saved ones. Another ``seed`` begins another random sequence, the
-            saved one goes on
+            saved one goes on (on the kind of device it was saved on; on another one ``learn()`` warns of other numbers)
         :return: model
         :raises ConfigError: for an unknown keyword
         :raises CheckpointError: if the file is missing, damaged or another agent's, or its parameters do not fit the

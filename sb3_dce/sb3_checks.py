@@ -38,20 +38,29 @@ def check_flags(owner: object) -> None:
 
 def check_device(device: Any) -> None:
     """
-    Refuse a device that PyTorch does not know, and CUDA where it finds none, before anything is built on it.
+    Refuse a device that PyTorch does not know, and one that it does not find, before anything is built on it.
 
     :param device: as PyTorch names it, or "auto"
-    :raises ConfigError: if it is something else, or a CUDA device where there is none
+    :raises ConfigError: if it is something else, a CUDA device that is not there, or one that holds no numbers here
     """
     if device == "auto":
         return
     try:
-        kind = th.device(device).type
+        wanted = th.device(device)
     except (RuntimeError, TypeError) as error:
         hint = "For example 'auto', 'cpu', 'cuda' or 'cuda:1'."
         raise ConfigError(f"device must be 'auto' or one of PyTorch's, got {device!r}", key="device", hint=hint) from error
-    if kind == "cuda" and not th.cuda.is_available():
-        raise ConfigError(f"device={device!r}, but PyTorch finds no CUDA device here", key="device", hint="Take 'auto'.")
+    if wanted.type == "cuda":
+        n_found = th.cuda.device_count() if th.cuda.is_available() else 0
+        if (wanted.index or 0) >= n_found:
+            found = f"{n_found or 'no'} CUDA device{'s' if n_found > 1 else ''}"
+            raise ConfigError(f"device={device!r}, but PyTorch finds {found} here", key="device", hint="Take 'auto'.")
+        return
+    try:
+        th.zeros(1, device=wanted).item()
+    except Exception as error:  # each kind of device has its own
+        what = f"device={device!r}, but PyTorch can keep no numbers on such a device here"
+        raise ConfigError(what, key="device", hint="Take 'auto'.") from error
 
 
 def check_logging(verbose: Any, stats_window_size: Any, tensorboard_log: Any) -> None:
@@ -228,19 +237,27 @@ def callback_frequencies(callback: BaseCallback) -> list[tuple[str, int]]:
     :param callback: callback, or a list or chain of them
     :return: name and value of every frequency in it, in timesteps
     """
-    found = [
-        (f"{type(callback).__name__}.{name}", getattr(callback, name))
+    return [
+        (f"{type(part).__name__}.{name}", getattr(part, name))
+        for part in nested_callbacks(callback)
         for name in ("eval_freq", "save_freq", "n_steps")
-        if isinstance(getattr(callback, name, None), int)
+        if isinstance(getattr(part, name, None), int)
     ]
+
+
+def nested_callbacks(callback: BaseCallback) -> list[BaseCallback]:
+    """
+    All callbacks that a training calls through one.
+
+    :param callback: callback, or a list or chain of them
+    :return: the callback itself, then those inside it, depth first
+    """
     children: list[BaseCallback | None] = []
     if isinstance(callback, CallbackList):
         children = list(callback.callbacks)
     elif isinstance(callback, EventCallback):
         children = [callback.callback, getattr(callback, "callback_on_new_best", None)]
-    for child in children:
-        found += [] if child is None else callback_frequencies(child)
-    return found
+    return [callback, *(part for child in children if child is not None for part in nested_callbacks(child))]
 
 
 def _makes_module(value: Any) -> bool:

@@ -22,10 +22,12 @@ def shift_limit(gamma: float, n: float = math.inf) -> float:
     """
     ``(1 - gamma^(n+1)) / (1 - gamma)``: shift of Q after n effective Bellman iterations, in units of beta_eff (Eq. 10).
 
-    :param gamma: discount factor in [0, 1)
+    :param gamma: discount factor in [0, 1]
     :param n: iterations, may be infinite
-    :return: dimensionless factor
+    :return: dimensionless factor; infinite for infinitely many without discount
     """
+    if gamma == 1.0:
+        return n + 1.0
     return (1.0 - gamma ** (n + 1)) / (1.0 - gamma)
 
 
@@ -37,7 +39,7 @@ def shift_factor(n_updates: int, gamma: float, tau: float) -> float:
     ``1 + gamma (1 - (1 - tau (1 - gamma))^(k-1)) / (1 - gamma)``; time constant ``1 / (tau (1 - gamma))`` steps.
 
     :param n_updates: gradient steps k
-    :param gamma: discount factor in [0, 1)
+    :param gamma: discount factor in [0, 1]
     :param tau: Polyak coefficient
     :return: dimensionless factor; 0 before the first step
     """
@@ -55,7 +57,7 @@ def value_shift_factor(n_updates: int, gamma: float, tau: float) -> float:
     Since ``q = gamma v - 1``, V falls by what Q falls beyond its own penalty, over gamma.
 
     :param n_updates: gradient steps k, at least 1
-    :param gamma: discount factor in (0, 1)
+    :param gamma: discount factor in (0, 1]
     :param tau: Polyak coefficient
     :return: dimensionless factor, in units of beta_eff
     """

@@ -14,7 +14,6 @@ from rich.table import Table
 from sb3_dce import hyperparams
 from sb3_dce.agents import agent_class
 from sb3_dce.base import OfflineAlgorithm
-from sb3_dce.checks import check_ends_with_evaluation
 from sb3_dce.data import find_file
 from sb3_dce.data.catalog import resolve
 from sb3_dce.data.locate import catalogue_id, short_name
@@ -25,7 +24,7 @@ from sb3_dce.files import quoted
 from sb3_dce.launch import launch_all, raise_first
 from sb3_dce.plots import plot_learning_curves
 from sb3_dce.rollouts import Rollouts, rollouts_of
-from sb3_dce.run_files import RunSpec, read_config
+from sb3_dce.run_files import RunSpec
 from sb3_dce.runs import check_before_running
 from sb3_dce.saving import existing_zip, saved_algo
 
@@ -72,9 +71,6 @@ def train_seeds(
         RunSpec(algo, dataset, seed, total, str(folder / f"seed_{seed}"), eval_freq, n_eval_episodes, overrides)
         for seed in seeds
     ]
-    # a run of an earlier version may have been begun without this check
-    if any(read_config(Path(s.folder)) is None for s in specs) and rollouts_of(dataset, n_eval_episodes) is not None:
-        check_ends_with_evaluation(total, eval_freq)
     check_before_running(specs)
     outcomes = launch_all(specs, workers, console)
     errors = [outcome for outcome in outcomes if isinstance(outcome, BaseException)]
@@ -82,12 +78,14 @@ def train_seeds(
     if not results:
         raise_first(errors, console)
     show_results(algo, results, console)
-    curves = {algo: [read_evaluations(Path(s.folder), None if spec is None else spec.id) for s in specs]}
+    complete = [Path(s.folder) for s, outcome in zip(specs, outcomes, strict=True) if not isinstance(outcome, BaseException)]
+    curves = {algo: [read_evaluations(run, None if spec is None else spec.id) for run in complete]}
     picture = plot_learning_curves(curves, folder / "learning_curve.png", title=name)
-    drawn = f", {picture.name}" if picture else ""
     evaluated = results[0]["returns"] is not None
     files = "model.zip, config.yml" + (", evaluations.csv" if evaluated else "")
-    console.print(f"saved  {folder}/seed_*/{files}{drawn}", markup=False, soft_wrap=True)
+    console.print(f"saved  {folder}/seed_*/{files}", markup=False, soft_wrap=True)
+    if picture is not None:
+        console.print(f"       {picture}", markup=False, soft_wrap=True)
     needs = "" if evaluated else " --env <id of its environment>"
     model = quoted(f"{folder}/seed_{results[0]['config']['seed']}/model.zip")
     console.print(f"next   sb3-dce evaluate {model}{needs}", markup=False, soft_wrap=True)
@@ -97,14 +95,14 @@ def train_seeds(
 
 def show_results(algo: str, results: list[dict[str, Any]], console: Console) -> None:
     """
-    Print a line per seed: return and normalised score of the last evaluation, and how long the run took.
+    Print a line per seed: return and normalised score of the last evaluation, and how long the run took, evaluations included.
 
     :param algo: name of the agent
     :param results: of its seeds
     :param console: where to print
     """
     table = Table(box=None, header_style="bold")
-    for title in ("agent", "seed", "return (last evaluation)", "normalised score", "train s"):
+    for title in ("agent", "seed", "return (last evaluation)", "normalised score", "train + eval s"):
         table.add_column(title, justify="left" if title == "agent" else "right")
     for row in results:
         if row["returns"] is None:

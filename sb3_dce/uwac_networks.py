@@ -89,7 +89,7 @@ class DropoutCritic(KeepDtype, BaseModel):
     :param features_extractor: network applied to the observations first
     :param features_dim: its output width
     :param activation_fn: activation of the hidden layers
-    :param normalize_images: divide image observations by 255
+    :param normalize_images: kept for Stable-Baselines3's interface; observations are never divided by 255
     :param n_critics: number of critics
     :param share_features_extractor: unused, always False
     :param dropout: probability that a hidden unit is dropped
@@ -328,7 +328,7 @@ class ActionVAE(KeepDtype, BaseModel):
     :param features_extractor: network applied to the observations first
     :param features_dim: its output width
     :param activation_fn: activation of the hidden layers
-    :param normalize_images: divide image observations by 255
+    :param normalize_images: kept for Stable-Baselines3's interface; observations are never divided by 255
     """
 
     optimizer: th.optim.Optimizer

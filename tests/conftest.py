@@ -146,6 +146,20 @@ def ctrl_c() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
+@pytest.fixture
+def legends(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """What the legend of each picture of curves says that is written from now on."""
+    figure = pytest.importorskip("matplotlib.figure").Figure
+    original, found = figure.savefig, []
+
+    def savefig(self: Any, *args: Any, **kwargs: Any) -> None:
+        found.append([text.get_text() for text in self.axes[0].get_legend().get_texts()])
+        original(self, *args, **kwargs)
+
+    monkeypatch.setattr(figure, "savefig", savefig)
+    return found
+
+
 @pytest.fixture(params=AGENTS)
 def agent(request: pytest.FixtureRequest) -> Agent:
     return AGENTS[request.param]

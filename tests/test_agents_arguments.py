@@ -95,6 +95,7 @@ WRONG: list[tuple[str, Any]] = [
     ("seed", 2**33),
     ("device", "cudaa"),
     ("device", None),
+    ("device", "meta"),  # which PyTorch knows, but which holds no numbers
 ]
 
 
@@ -110,6 +111,13 @@ WRONG: list[tuple[str, Any]] = [
 def test_wrong_argument_is_refused_by_the_constructor(key: str, name: str, value: Any, spaces_env: SpacesEnv) -> None:
     with pytest.raises(ConfigError, match=name):
         make(AGENTS[key], env=spaces_env, **{name: value})
+
+
+def test_device_beyond_those_that_are_there_is_refused(spaces_env: SpacesEnv, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(th.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(th.cuda, "device_count", lambda: 1)
+    with pytest.raises(ConfigError, match="device='cuda:1', but PyTorch finds 1 CUDA device here"):
+        make(AGENTS["BC"], env=spaces_env, device="cuda:1")
 
 
 @pytest.mark.parametrize(

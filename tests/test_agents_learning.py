@@ -299,19 +299,23 @@ def break_some_rows(model: OfflineAlgorithm) -> None:
     buffer.rows[::75, buffer.obs_dim + buffer.action_dim] = float("inf")
 
 
-def test_updates_are_made_again_with_the_learning_rate_and_the_batches_they_had(transitions: Transitions) -> None:
-    """A falling rate, a chunk of updates per call, and a weight that follows what was found."""
+@pytest.mark.parametrize("begin", [0, 3])
+def test_updates_are_made_again_with_the_learning_rate_and_the_batches_they_had(begin: int, transitions: Transitions) -> None:
+    """A falling rate, a chunk of updates per call, perhaps between two multiples, and a weight that follows what was found."""
     settings: dict[str, Any] = {"batch_size": 2, "seed": 3, "gradient_steps": 5, "learning_rate": LinearlyToZero(1e-2)}
     settings |= {"adaptive_ood_weight": True, "steps_per_epoch": 3, "ood_weight_steps": 1, "n_critics": 3, "n_ood_actions": 2}
     model, whole = (make(AGENTS["PBRL"], dataset=transitions, **settings) for _ in range(2))
+    for each in (model, whole):
+        each.learn(begin)
     break_some_rows(model)
     with pytest.raises(DivergenceError, match=r"at update \d+: .*rewards not finite in rows? \d+") as caught:
-        model.learn(200)
+        model.learn(200, reset_num_timesteps=False)
     before = int(caught.value.index or 0) - 1
-    whole.learn(200, Recorder(stop_at=before - before % 5), log_interval=None)
-    if before % 5:
-        whole._update_current_progress_remaining(whole.num_timesteps, 200)
-        whole.train(before % 5, 2)
+    rest = min(before % 5, (before - begin) % 5)
+    whole.learn(200, Recorder(stop_at=before - rest - begin), log_interval=None, reset_num_timesteps=False)
+    if rest:
+        whole._update_current_progress_remaining(whole.num_timesteps, begin + 200)
+        whole.train(rest, 2)
     assert len(model.recorded_q) == len(whole.recorded_q) > 1  # type: ignore[attr-defined]
     assert before > 5 and same(weights(model), weights(whole))
 

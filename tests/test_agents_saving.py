@@ -19,7 +19,7 @@ import torch as th
 from agents_under_test import AGENTS, Agent, accepts, make, same, some_observations, weights
 
 from sb3_dce import OfflineDCE, Transitions
-from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError
+from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError, SB3DCEWarning
 
 
 @pytest.mark.parametrize("by_stream", [False, True], ids=["path", "stream"])
@@ -286,11 +286,17 @@ def test_parameters_of_a_damaged_file_are_refused(transitions: Transitions, tmp_
     assert same(before, weights(model))
 
 
-def test_random_state_of_another_kind_of_device_begins_anew_from_the_seed(transitions: Transitions, tmp_path: Path) -> None:
+def test_random_state_of_another_kind_of_device_gives_way_to_new_numbers_not_to_the_first(
+    transitions: Transitions, tmp_path: Path
+) -> None:
     model = make(AGENTS["BC"], dataset=transitions, seed=3).learn(2)
     model._generator, model.rng_state = None, th.zeros(16, dtype=th.uint8)  # as large as that of CUDA
     model.save(tmp_path / "model.zip")
     loaded = [AGENTS["BC"].cls.load(tmp_path / "model.zip", dataset=transitions) for _ in range(2)]
+    for each in loaded:
+        with pytest.warns(SB3DCEWarning, match="saved on another kind of device: on cpu other random numbers follow"):
+            state = each._training_generator().get_state()
+        assert not th.equal(state, th.Generator().manual_seed(3).get_state())
     runs = [weights(each.learn(2, reset_num_timesteps=False)) for each in loaded]
     assert same(*runs) and loaded[0]._n_updates == 4
 

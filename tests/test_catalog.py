@@ -86,8 +86,10 @@ def test_data_and_evaluation_agree_on_what_a_name_stands_for(name: str, dataset_
 
 
 def test_unknown_name_lists_close_matches() -> None:
-    with pytest.raises(DatasetError, match=r"walker2d-medium-v2.*datasets list --all"):
+    with pytest.raises(DatasetError, match=r"Did you mean 'walker2d-medium-v2', '.*datasets list --all"):
         resolve("waker2d-medium-v2")
+    with pytest.raises(DatasetError, match=r"Did you mean 'hopper-"):
+        resolve("hopper")
 
 
 @pytest.mark.parametrize(

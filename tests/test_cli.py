@@ -184,7 +184,7 @@ def test_an_interrupted_run_goes_on_and_ends_like_an_uninterrupted_one(tmp_path:
         (("reproduce", "table1", "--report-only", "--agents", "BC"), ("trains nothing", "leave out")),
         (("reproduce", "table1", "--reuse", "."), ("no result rows in the folder", "--import")),
         (("reproduce", "table1", "--import", "."), ("no runs below the folder",)),
-        (("reproduce", "table1", "--page", "."), ("a folder is no file", "results.md")),
+        (("reproduce", "table1", "--page", "."), ("a folder is no file", "Name a file in it")),
         (("reproduce", "table1", "--precision", "tf32", "--device", "cpu"), ("tf32 needs", "Leave it out")),
         (("evaluate", "missing.zip"), ("no such file",)),
         (("datasets", "info", "nonsense"), ("nonsense",)),
@@ -211,6 +211,19 @@ def test_what_nobody_foresaw_is_a_message_and_a_report(tmp_path: Path, monkeypat
     assert outcome.stderr.startswith("Error: RuntimeError: out of memory, says [the device]")
     (report,) = tmp_path.iterdir()
     assert str(report) in outcome.stderr and "Traceback" in report.read_text()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("train", TINY, "--eval-episodes"),
+        ("compare", "--dataset", TINY, "--eval-episodes"),
+        ("evaluate", "m.zip", "--episodes"),
+    ],
+)
+def test_evaluations_with_more_episodes_than_seeds_are_refused(command: tuple[str, ...]) -> None:
+    outcome = sb3_dce(*command, "10001")
+    assert outcome.code == 2 and command[-1] in outcome.stderr and "10000" in outcome.stderr
 
 
 @pytest.mark.parametrize("command", [("reproduce", "config-tables"), ("compare", "--dataset", TINY, "--updates", "4")])

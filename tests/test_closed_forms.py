@@ -490,6 +490,7 @@ def test_shift_factor_at_the_ends() -> None:
     assert theory.shift_factor(10**9, 0.99, 0.005) == pytest.approx(100.0, abs=1e-9)
     assert theory.shift_factor(7, 1.0, 0.005) == pytest.approx(shift_by_recursion(7, 1.0, 0.005), abs=1e-12)
     assert math.isclose(theory.shift_limit(0.9), 10.0)
+    assert (theory.shift_limit(1.0, 3), theory.shift_limit(1.0)) == (4.0, math.inf)
 
 
 @pytest.mark.parametrize(("gamma", "tau"), [(0.9, 0.05), (0.99, 0.005)])

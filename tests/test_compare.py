@@ -6,7 +6,6 @@ import csv
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -139,6 +138,8 @@ def test_data_without_an_environment_have_seconds_and_no_scores(tmp_path: Path, 
     Transitions.from_arrays(**arrays, rewards=np.arange(n, dtype=np.float32), **flags).to_npz(tmp_path / "logs.npz")
     (row,) = compare(str(tmp_path / "logs.npz"), ["bc"], 2, range(1), 2, 1, 1, tmp_path / "out", Console(width=140))
     assert np.isnan(row.mean) and "Nothing was evaluated" in capsys.readouterr().out
+    # any length will do, where nothing is evaluated
+    compare(str(tmp_path / "logs.npz"), ["bc"], 3, range(1), 2, 1, 1, tmp_path / "odd", Console(quiet=True))
     text = (tmp_path / "out" / "comparison.md").read_text()
     assert "# Agents on logs" in text and "nan" not in text
 
@@ -171,7 +172,7 @@ def test_settings_and_lengths_of_nobody_are_refused(tmp_path: Path) -> None:
 
 
 def test_table_is_made_from_the_complete_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    scores = {"dce": [40.0, 44.0, 51.0], "offline_bc": [40.0]}
+    scores: dict[str, list[float | None]] = {"offline_sac": [None], "dce": [40.0, 44.0, 51.0], "offline_bc": [40.0]}
     for algo, values in scores.items():
         for seed, score in enumerate(values):
             folder = tmp_path / algo / f"seed_{seed}"
@@ -180,19 +181,22 @@ def test_table_is_made_from_the_complete_runs(tmp_path: Path, capsys: pytest.Cap
             (folder / "result.json").write_text(json.dumps({**result, "normalized_score": score}))
     (tmp_path / "dce" / "seed_3").mkdir()  # begun, not complete
     write_evaluations(tmp_path / "dce" / "seed_3", [Evaluation(10, (1.0, 2.0), (5, 5), None)])
-    specs = specs_of(tmp_path, {"offline_bc": 1, "dce": 4, "offline_iql": 1}, 2000)
+    specs = specs_of(tmp_path, {"offline_bc": 1, "offline_sac": 1, "dce": 4, "offline_iql": 1}, 2000)
     rows = summarize(tmp_path, specs, resolve(TINY), 4651.0, Console(width=120))
-    assert [(row.agent, row.n_seeds, row.mean) for row in rows] == [("offline_bc", 1, 40.0), ("dce", 3, 45.0)]
-    assert rows[1].std == pytest.approx(np.std(scores["dce"], ddof=1)) and np.isnan(rows[0].std)
+    assert [(row.agent, row.n_seeds, row.mean) for row in rows if row.agent != "offline_sac"] == [
+        ("offline_bc", 1, 40.0),
+        ("dce", 3, 45.0),
+    ]
+    assert rows[2].std == pytest.approx(np.std([40.0, 44.0, 51.0], ddof=1)) and np.isnan(rows[0].std)
     assert rows[0].seconds_per_1000 == 5.0
     shown = capsys.readouterr().out
-    assert shown.index("dce") < shown.index("offline_bc"), "the best first"
+    places = [shown.index(name) for name in ("dce", "offline_bc", "offline_sac")]
+    assert places == sorted(places), "the best first, last what has no score"
+    assert "Not evaluated" in shown
     assert f"{normalized_score(TINY, 4651.0):.1f}" in shown
 
 
-def test_runs_without_an_evaluation_are_left_out_of_the_curves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn: dict[str, Any] = {}
-    monkeypatch.setattr("sb3_dce.compare.plot_learning_curves", lambda curves, *_, **__: drawn.update(curves))
+def test_runs_without_an_evaluation_are_left_out_of_the_curves(tmp_path: Path, legends: list[list[str]]) -> None:
     for algo, seeds in {"dce": 3, "offline_bc": 1}.items():
         for seed in range(seeds):
             folder = tmp_path / algo / f"seed_{seed}"
@@ -203,7 +207,7 @@ def test_runs_without_an_evaluation_are_left_out_of_the_curves(tmp_path: Path, m
         evaluations = [Evaluation(n, (1.0, 2.0), (5, 5), None) for n in (10, 20)]
         write_evaluations(tmp_path / "dce" / f"seed_{seed}", evaluations)
     summarize(tmp_path, specs_of(tmp_path, {"dce": 3, "offline_bc": 1}, 20), resolve(TINY), None, Console(quiet=True))
-    assert list(drawn) == ["dce"] and [len(seed) for seed in drawn["dce"]] == [2, 2]
+    assert legends == [["dce (mean of 2 seeds)"]]
 
 
 def test_agents_that_do_not_exist_or_come_twice_are_refused(tmp_path: Path) -> None:

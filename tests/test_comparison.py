@@ -46,12 +46,25 @@ def test_one_changed_bit_is_not_identical() -> None:
     assert first.content_hash != second.content_hash
 
 
-def test_samples_of_the_same_thing_are_called_different_as_rarely_as_promised() -> None:
-    cards = [DatasetCard.of(made(seed, 30)) for seed in range(200)]
+@pytest.mark.parametrize("episodes", [10, 30])
+def test_samples_of_the_same_thing_are_called_different_as_rarely_as_promised(episodes: int) -> None:
+    cards = [DatasetCard.of(made(seed, episodes)) for seed in range(200)]
     different = sum(
         compare_datasets(a, b).verdict != "statistically equal" for a, b in zip(cards[::2], cards[1::2], strict=True)
     )
     assert different <= 3  # of 100, where 0.3 are expected; four have a chance of one in a few thousand
+
+
+@pytest.mark.parametrize(("gap", "expected"), [(1.5, "statistically equal"), (1.7, "different")])
+def test_few_episodes_explain_more_by_chance(gap: float, expected: str) -> None:
+    """
+    Two means of ten episodes each, with deviation 1 (divisor n): their standard error is sqrt(2 / 9) = 0.471, and what three
+    standard errors are for a normal distribution are 3.4755 for Student's t with 18 degrees of freedom: 1.64 in all.
+    """
+    facts = {"id": "mine", "rows": 10, "episodes": 10, "sha256": None, "stds": {"return": 1.0}}
+    first, second = (DatasetCard(content_hash=f"{mean}", means={"return": mean}, **facts) for mean in (0.0, gap))
+    comparison = compare_datasets(first, second)
+    assert comparison.verdict == expected and comparison.limit == pytest.approx(3.4755, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -146,7 +159,7 @@ def test_the_command_compares_files_and_cards(tmp_path: Path) -> None:
     assert same.code == 0 and same.stdout.endswith("identical\n")
     again = sb3_dce("datasets", "compare", str(tmp_path / "again.hdf5"), card)
     assert again.code == 0
-    assert "statistically equal: none of 10 quantities further apart than 3.6 standard errors" in again.stdout
+    assert "statistically equal: none of 10 quantities further apart than by chance, which explains up to 3.8" in again.stdout
     other = sb3_dce("datasets", "compare", card, str(tmp_path / "other.hdf5"))
     assert other.code == 1 and "mean of action 0" in other.stdout and "different: 2 of 10" in other.stdout
     assert sb3_dce("datasets", "compare", mine, str(tmp_path / "no.json")).code == 2

@@ -15,7 +15,7 @@ import pytest
 from dataset_files import ACT_DIM, N_ROWS, OBS_DIM, base_arrays, write_plain
 
 from sb3_dce import OfflineBC, OfflineDCE
-from sb3_dce.data import Transitions, file_sha256, load_transitions, resolve
+from sb3_dce.data import DatasetSpec, Transitions, file_sha256, load_transitions, resolve
 from sb3_dce.data.hash_record import record_path, write_record
 from sb3_dce.errors import (
     ConfigError,
@@ -247,6 +247,14 @@ def test_each_warning_is_issued_once_per_load() -> None:
     with pytest.warns(DatasetWarning) as caught:
         info = Transitions.from_arrays(**arrays).info
     assert [str(warning.message) for warning in caught] == [f"arrays: {text}" for text in info.warnings]
+
+
+@pytest.mark.parametrize("spec", [None, SPEC], ids=["no entry", "entry"])
+def test_a_width_that_the_user_wants_is_not_said_to_be_the_catalogues(spec: DatasetSpec | None) -> None:
+    message = "observations has width 3, 99 is wanted by obs_dim=; next_observations has width 3, 99 is wanted by obs_dim="
+    with pytest.raises(DatasetFormatError, match=f"{message}. Correct the width") as caught:
+        Transitions.from_arrays(**base_arrays(), spec=spec, obs_dim=99)
+    assert "Hopper" not in str(caught.value)
 
 
 def test_kitchen_observation_of_59_points_to_the_mapping() -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
+import yaml
 from commands import sb3_dce
 
 from sb3_dce import OfflineDCE, demo
@@ -28,9 +30,27 @@ def test_demo_trains_compares_and_saves(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_fresh_deletes_what_a_demo_wrote_and_nothing_else(tmp_path: Path) -> None:
-    own = ("dce_0/model.zip", "offline_bc_1/config.yml", "results.json", "learning_curve.png")
-    other = ("notes.txt", "dce_notes.txt", "models/dce_0/model.zip")
-    for name in own + other:
-        write_text(tmp_path / name, "")
+    def run_of(algo: str, seed: int = 0, dataset: str = demo.DATASET) -> str:
+        return yaml.safe_dump({"run": {"algo": algo, "seed": seed, "dataset": dataset}, "dataset": {}, "hyperparameters": {}})
+
+    own = {"dce_0/config.yml": run_of("dce"), "dce_0/model.zip": "", "offline_bc_12/config.yml": run_of("offline_bc", 12)}
+    own |= {"results.json": "", "learning_curve.png": ""}
+    other = {"notes.txt": "", "dce_notes.txt": "", "models/dce_0/config.yml": run_of("dce")}
+    # folders of the user's own that are called as those of a demo, or nearly so
+    other |= {"dce_paper/draft.tex": "", "dce_1/weights.pt": "", "dce_2/config.yml": "lr: 0.1", "dce_3/config.yml": "{"}
+    other |= {"dce_0 of June/config.yml": run_of("dce"), "dce_4/config.yml": run_of("dce", 4, "hopper-medium-v2")}
+    other |= {"offline_iql_0/config.yml": run_of("offline_iql")}
+    for name, text in {**own, **other}.items():
+        write_text(tmp_path / name, text)
     demo._delete_demo(tmp_path)
-    assert sorted(p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()) == sorted(other)
+    assert {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()} == set(other)
+
+
+def test_simulator_that_is_missing_is_named_before_anything_is_deleted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "imageio", None)  # as where it is not installed
+    (tmp_path / "results.json").write_text("{}")
+    outcome = sb3_dce("demo", "--out", str(tmp_path), "--fresh")
+    assert outcome.code == 2 and (tmp_path / "results.json").exists()
+    assert "needs the package 'imageio'" in outcome.stderr and 'pip install "gymnasium[mujoco]"' in outcome.stderr

@@ -12,16 +12,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from gymnasium.wrappers import TimeLimit
 from rich.console import Console
 from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
 from test_population_runs import CPU, specs
 from update_tools import all_tensors, largest_difference
 
-from sb3_dce import OfflineDCE, OfflineUWAC
+from sb3_dce import OfflineBC, OfflineDCE, OfflineUWAC, Transitions
 from sb3_dce.envs import make_env_if_possible
 from sb3_dce.errors import ConfigError, DatasetError
 from sb3_dce.evaluation import EvaluationCallback
@@ -133,6 +135,31 @@ def test_callback_with_workers_writes_what_it_writes_without(tmp_path: Path) -> 
         assert callback.pool._executor is None, "its workers end with the training"
         seen.append((callback.evaluations, (folder / "evaluations.csv").read_text()))
     assert seen[0] == seen[1]
+
+
+def test_what_workers_cannot_make_is_refused_before_training(transitions: Transitions, point_mass: gym.Env) -> None:
+    model = OfflineBC("MlpPolicy", dataset=transitions, policy_kwargs=SMALL)
+    with pytest.raises(ConfigError, match="known by a dataset's name"):
+        model.learn(4, EvaluationCallback(Rollouts(lambda: point_mass, 1), None, 4, n_workers=1))
+    assert model.num_timesteps == 0
+    model.learn(4, EvaluationCallback(Rollouts(lambda: point_mass, 1), None, 4))
+
+
+def test_workers_end_with_a_training_that_fails() -> None:
+    class Fails(BaseCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 5:
+                raise RuntimeError("of another callback")
+            return True
+
+    rollouts = make_rollouts("halfcheetah-tiny-sb3", 1)
+    evaluation = EvaluationCallback(rollouts, None, 4, n_workers=1)
+    model = OfflineBC.load_dataset("halfcheetah-tiny-sb3", policy_kwargs=SMALL, batch_size=16)
+    before = set(mp.active_children())
+    with pytest.raises(RuntimeError, match="of another callback"):
+        model.learn(8, [evaluation, Fails()])
+    assert [e.n_updates for e in evaluation.evaluations] == [4], "there was a worker"
+    assert set(mp.active_children()) <= before and evaluation.pool._executor is None
 
 
 def test_population_killed_before_its_evaluation_was_written_evaluates_again(

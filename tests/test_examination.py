@@ -88,6 +88,7 @@ def _no_timeouts(arrays: Arrays) -> None:
 
 def _no_flags(arrays: Arrays) -> None:
     arrays["timeouts"][:], arrays["terminals"][:] = False, False
+    del arrays["next_observations"]  # whose jumps would show the ends
 
 
 def _open(arrays: Arrays) -> None:
@@ -180,6 +181,37 @@ def test_the_place_is_named(fault: str, place: str, tmp_path: Path) -> None:
     change(arrays)
     where = named(checked(tmp_path, arrays), name).where
     assert where is not None and re.search(place, where), where
+
+
+@pytest.mark.parametrize("drop_nonfinite", [False, True])
+def test_what_no_transition_shows_is_a_note(drop_nonfinite: bool, tmp_path: Path) -> None:
+    arrays = clean_arrays()
+    del arrays["next_observations"]
+    arrays["rewards"][39], arrays["actions"][159, 1] = np.nan, np.inf  # at time limits, which cannot be used
+    examination = checked(tmp_path, arrays, drop_nonfinite=drop_nonfinite)
+    check = named(examination, "finite values")
+    assert (check.verdict, check.count) == ("note", 2)
+    assert check.what == "2 NaN or infinite values are in rows that are not used"
+    assert examination.transitions is not None and examination.transitions.info.episodes == 4  # one return is not known
+
+
+@pytest.mark.parametrize(("row", "place"), [(40, "rows that are not used"), (39, "observation columns 1")])
+def test_huge_observation_is_found_where_it_is_used(row: int, place: str, tmp_path: Path) -> None:
+    """Row 39 is left out, but it is what follows row 38; what follows row 39 is not known, and row 40 is not finite."""
+    arrays = clean_arrays()
+    del arrays["next_observations"]
+    arrays["rewards"][40], arrays["observations"][row, 1] = np.nan, 2e6
+    check = named(checked(tmp_path, arrays, drop_nonfinite=True), "huge observations")
+    assert check.verdict == "warning" and check.where == place and check.count == (place != "rows that are not used")
+
+
+def test_ends_that_only_jumps_show_are_ends(tmp_path: Path) -> None:
+    arrays = clean_arrays()
+    arrays["timeouts"][:], arrays["terminals"][:] = False, False
+    examination = checked(tmp_path, arrays)
+    check = named(examination, "terminals or timeouts")
+    assert (check.verdict, check.what) == ("ok", "0 terminals, 4 ends without one")
+    assert "4 whole episodes" in named(examination, "episode ends").what
 
 
 def test_the_other_checks_go_on_after_a_refusal(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from commands import sb3_dce
 
 from sb3_dce import load_dataset
 from sb3_dce.data import D4RLFile, file_sha256, resolve, write_hdf5
-from sb3_dce.errors import ConfigError, DatasetError, DatasetFormatError, DatasetNotFoundError
+from sb3_dce.errors import CheckpointError, ConfigError, DatasetError, DatasetFormatError, DatasetNotFoundError
 from sb3_dce.numpy_policy import MLPPolicy
 from sb3_dce.recording import RecordingSpec
 from sb3_dce.recording.episodes import EpisodeRunner
@@ -190,6 +190,22 @@ def test_buffer_keeps_its_rows_and_flags(tmp_path: Path) -> None:
     assert (made.attrs["episodes"], made.attrs["terminals"], made.attrs["timeouts"]) == (2, 1, 1)
 
 
+def test_buffer_with_fewer_rows_than_are_wanted_is_refused(tmp_path: Path) -> None:
+    source = buffer_file(tmp_path / "b.hdf5")
+    with pytest.raises(DatasetError, match=r"b\.hdf5: has 60 rows, 70 are wanted.*fewer --rows"):
+        generate("hopper-medium-replay-sb3", tmp_path, Sources(buffer=source), rows=70)
+    training = Training(ANY_RETURN, {**TINY_SAC, "max_steps": 60})
+    with pytest.raises(DatasetError, match=r"hopper-sac-seed0: has 60 rows, 70 are wanted"):
+        generate("hopper-medium-replay-sb3", tmp_path, training=training, rows=70)
+
+
+@pytest.mark.parametrize(("kind", "rows", "fewest"), [("random", 0, 1), ("medium-expert", 1, 2)])
+def test_too_few_rows_are_refused_before_anything_is_recorded(kind: str, rows: int, fewest: int, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=f"must be at least {fewest}, got {rows}"):
+        generate(f"hopper-{kind}-sb3", tmp_path, rows=rows)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_buffer_of_another_environment_is_refused(tmp_path: Path) -> None:
     source = buffer_file(tmp_path / "b.hdf5", obs_dim=17)
     with pytest.raises(DatasetFormatError, match="width 17, 11 is wanted"):
@@ -221,6 +237,17 @@ def test_missing_medium_and_replay_are_stages_of_one_run(tmp_path: Path) -> None
         len(generate("hopper-medium-replay-sb3", tmp_path, training=training, force=True).attrs)
         and load_dataset(tmp_path / "hopper-medium-replay-sb3.hdf5").info.file_rows == 60
     )
+
+
+def test_training_is_only_announced_when_there_is_some(tmp_path: Path) -> None:
+    training = Training(ANY_RETURN, {**TINY_SAC, "max_steps": 60})
+    first, again = [], []
+    generate("hopper-medium-replay-sb3", tmp_path, training=training, note=first.append)
+    generate("hopper-medium-sb3", tmp_path, training=training, rows=5, note=again.append)
+    folder = tmp_path / "training" / "hopper-sac-seed0"
+    assert first[0] == f"no buffer given or found: that of the SAC run in {folder}"
+    assert first[1].startswith("training SAC from step 0 on") and "return" in first[2]
+    assert again == [f"no policy given or found: that of the SAC run in {folder}"]
 
 
 def test_replay_is_the_buffer_with_true_terminals_and_timeouts(tmp_path: Path) -> None:
@@ -291,6 +318,32 @@ def test_interrupted_training_goes_on_from_its_last_evaluation(tmp_path: Path) -
     rows = again._rows()
     assert len(rows["rewards"]) == 180 and bool(rows["timeouts"][59]) == was_open
     assert np.array_equal(rows["rewards"][:60], before["rewards"])
+
+
+def test_part_that_a_killed_run_left_is_no_part_of_the_longer_one(tmp_path: Path) -> None:
+    sac_run(tmp_path, NO_RETURN, max_steps=60).expert()
+    before = {path: path.read_bytes() for path in (tmp_path / "state.json", tmp_path / "model-60.zip")}
+    sac_run(tmp_path, NO_RETURN, max_steps=90).expert()
+    for path, content in before.items():  # as if it had been killed when it had written its rows
+        path.write_bytes(content)
+    longer = sac_run(tmp_path, NO_RETURN, max_steps=120)
+    longer.expert()
+    assert {path.name for path in (tmp_path / "replay").iterdir()} == {"0-60.npz", "60-90.npz", "60-120.npz"}
+    buffer = longer._loaded_model().replay_buffer
+    assert buffer is not None and np.array_equal(longer._rows()["actions"], buffer.actions[:120, 0])
+
+
+@pytest.mark.parametrize("text", ["[]", "1", '"text"', "{", '{"config": {}}', "steps", "evaluations", "cuts"])
+def test_damaged_state_of_a_run_is_said(text: str, tmp_path: Path) -> None:
+    run = sac_run(tmp_path, ANY_RETURN)
+    run.medium()
+    state = json.loads((tmp_path / "state.json").read_text())
+    if text in state:
+        del state[text]
+        text = json.dumps(state)
+    (tmp_path / "state.json").write_text(text)
+    with pytest.raises(CheckpointError, match=r"state\.json: damaged.*Delete the folder"):
+        sac_run(tmp_path, ANY_RETURN)
 
 
 def test_run_is_only_continued_with_its_own_settings(tmp_path: Path) -> None:

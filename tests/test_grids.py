@@ -12,6 +12,7 @@ from commands import sb3_dce
 from sb3_dce.configuration import config_hash, differences
 from sb3_dce.data.locate import DATASETS_VARIABLE
 from sb3_dce.errors import ConfigError, DatasetNotFoundError
+from sb3_dce.experiments import grid
 from sb3_dce.experiments.grid import (
     EMBEDDED,
     SCALES,
@@ -20,6 +21,7 @@ from sb3_dce.experiments.grid import (
     expand,
     experiment_ids,
     load_experiment,
+    planned_id,
     present_datasets,
     source_of,
     variant_hash,
@@ -57,6 +59,15 @@ def test_every_experiment_of_the_list_has_a_grid() -> None:
     assert set(ASKED_FOR) <= set(IDS)
     covered = {re.match(r"E\d+", item).group() for name in IDS for item in load_experiment(name).items}  # type: ignore[union-attr]
     assert covered == {f"E{n}" for n in range(1, 28)}
+
+
+def test_experiments_without_a_place_in_the_order_come_last_by_their_letters(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("scales", "bounds", "table1", *"gecafbd"):
+        (tmp_path / f"{name}.yml").touch()
+    monkeypatch.setattr(grid, "_grids", lambda: tmp_path)
+    assert experiment_ids() == ["table1", "bounds", *"abcdefg"]
 
 
 def test_full_scale_of_the_gym_table_is_the_protocol(data_folder: Path, tmp_path: Path) -> None:
@@ -111,6 +122,11 @@ def test_missing_data_are_said_with_the_command_that_makes_them(data_folder: Pat
         plan("table1", "cpu", tmp_path)
     with pytest.raises(DatasetNotFoundError, match="sb3-dce datasets download kitchen-mixed-v0"):
         plan("fig-tau", "cpu", tmp_path, datasets=["kitchen-mixed"])
+    either = (
+        r"datasets download halfcheetah-random-v2, or sb3-dce datasets generate halfcheetah-random-sb3.*--datasets present"
+    )
+    with pytest.raises(DatasetNotFoundError, match=either):
+        plan("table1", "full", tmp_path)
     put(data_folder, "hopper-medium-sb3")
     experiment = load_experiment("table1")
     assert present_datasets(experiment, experiment.scales["cpu"]) == ["hopper-medium-v2"]
@@ -129,6 +145,26 @@ def test_unknown_names_are_refused_with_what_there_is(tmp_path: Path) -> None:
         load_experiment("fig-betta")
     with pytest.raises(ConfigError, match=r"fig-beta has no dataset 'hopper-medium-v2'. It has halfcheetah-medium-v2"):
         plan("fig-beta", "cpu", tmp_path, datasets=["hopper-medium"])
+
+
+def test_dataset_of_a_grid_is_named_by_its_id_and_not_by_a_file(data_folder: Path, tmp_path: Path) -> None:
+    put(data_folder, "hopper-medium-sb3")
+    with pytest.raises(ConfigError, match=r"no dataset '/elsewhere/hopper-medium-sb3\.hdf5'.*\$SB3_DCE_DATASETS"):
+        plan("table1", "cpu", tmp_path, datasets=["/elsewhere/hopper-medium-sb3.hdf5"])  # the other would be taken
+
+
+def test_data_that_a_scale_would_take_are_those_that_are_here(data_folder: Path) -> None:
+    hopper, kitchen = load_experiment("table1").dataset("hopper-medium-v2"), load_experiment("fig-tau").datasets[-1]
+
+    def planned() -> list[str]:
+        return [planned_id(hopper, source) for source in ("embedded", "twin", "d4rl")]
+
+    assert planned() == [EMBEDDED, "hopper-medium-sb3", "hopper-medium-v2"]
+    put(data_folder, "hopper-medium-sb3")
+    assert planned() == [EMBEDDED, "hopper-medium-sb3", "hopper-medium-sb3"]
+    put(data_folder, "hopper-medium-v2")
+    assert planned() == [EMBEDDED, "hopper-medium-sb3", "hopper-medium-v2"]
+    assert planned_id(kitchen, "twin") == kitchen.paper == "kitchen-mixed-v0"
 
 
 @pytest.mark.parametrize("name", IDS)

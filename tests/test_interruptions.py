@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from contextlib import nullcontext
 from dataclasses import replace
+from multiprocessing.connection import Connection
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 import yaml
@@ -26,11 +31,11 @@ from update_tools import all_tensors, largest_difference
 from sb3_dce import OfflineDCE, OfflineIQL, configuration, launch
 from sb3_dce.data import find_file
 from sb3_dce.errors import CheckpointError, ConfigError
-from sb3_dce.evaluation import read_evaluations
+from sb3_dce.evaluation import Evaluation, read_evaluations, write_evaluations
 from sb3_dce.experiments import results
-from sb3_dce.launch import RunFailedError, train_one
-from sb3_dce.run_files import RunSpec, read_result, write_divergence
-from sb3_dce.runs import StoppedError, check_before_running, run
+from sb3_dce.launch import RunFailedError, _Workers, train_one
+from sb3_dce.run_files import RunSpec, last_metrics, read_config, read_result, seconds_before, write_divergence
+from sb3_dce.runs import Progress, StoppedError, check_before_running, run
 from sb3_dce.saving import saved_timesteps
 
 TINY = "halfcheetah-tiny-sb3"
@@ -102,6 +107,42 @@ def test_changed_row_of_the_hyperparameter_file_makes_another_run(tmp_path: Path
     assert OfflineDCE.load(tmp_path / "other" / "model.zip").beta == 4.0, "the test changes what is compared, not the row"
 
 
+def test_run_with_numbers_of_numpy_and_a_function_goes_on(tmp_path: Path) -> None:
+    def asked(rate: Callable[[float], float]) -> RunSpec:
+        numbers = {"batch_size": np.int64(16), "beta": np.float64(2), "beta_final": None, "beta_rate": 0}
+        return spec(tmp_path, 20, **numbers, learning_rate=rate)
+
+    def constant() -> Callable[[float], float]:
+        return lambda remaining: 1e-3
+
+    with pytest.raises(StoppedError):
+        run(asked(constant()), stop=after(12))
+    config = read_config(tmp_path)
+    assert config is not None and config["run"]["overrides"]["beta"] == 2.0
+    with pytest.raises(ConfigError, match="other settings"):
+        run(asked(lambda remaining: 1e-4))
+    run(asked(constant()))  # a function of the same name at another address, as in another process
+    result = read_result(tmp_path)
+    assert result is not None and result["config"] == config["run"]
+
+
+def test_run_that_goes_on_elsewhere_keeps_where_it_began(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for steps, version in ((12, "0.1.0"), (5, "0.2.0"), (2, "0.2.0"), (None, "0.3.0")):
+        monkeypatch.setattr("sb3_dce.__version__", version)
+        with nullcontext() if steps is None else pytest.raises(StoppedError):
+            run(spec(tmp_path, 30), **({} if steps is None else {"stop": after(steps)}))
+    config = read_config(tmp_path)
+    assert config is not None and config["versions"]["sb3_dce"] == "0.1.0"
+    assert config["resumed_with"] == [{"n_updates": 12, "sb3_dce": "0.2.0"}, {"n_updates": 19, "sb3_dce": "0.3.0"}]
+    rows = results.rows_of_run(tmp_path, "table1")
+    assert rows is not None and rows["code_version"].str.startswith("0.1.0").all()
+    for name in ("model.zip", "result.json"):
+        (tmp_path / name).unlink()
+    run(spec(tmp_path, 30))  # begun anew: nothing is left of the beginning
+    config = read_config(tmp_path)
+    assert config is not None and config["versions"]["sb3_dce"] == "0.3.0" and "resumed_with" not in config
+
+
 def test_logs_of_work_that_is_done_again_are_forgotten(tmp_path: Path) -> None:
     for steps in (12, 13):
         with pytest.raises(StoppedError):
@@ -158,6 +199,14 @@ def test_damaged_checkpoint_says_what_to_delete(tmp_path: Path) -> None:
     assert run(spec(tmp_path, 30))["n_updates"] == 30
 
 
+def test_file_that_cannot_be_read_is_not_called_damaged(tmp_path: Path) -> None:
+    for name, read in (("result.json", read_result), ("evaluations.npz", lambda folder: read_evaluations(folder, None))):
+        (tmp_path / name).mkdir()  # the system refuses to read it, whoever asks
+        with pytest.raises(CheckpointError, match=f"{name}: the file cannot be read: .*Check the permissions") as caught:
+            read(tmp_path)
+        assert "elete" not in str(caught.value)
+
+
 def test_seconds_of_the_parts_of_a_run_add_up(tmp_path: Path) -> None:
     with pytest.raises(StoppedError):
         run(spec(tmp_path, 30), stop=after(12))
@@ -167,13 +216,72 @@ def test_seconds_of_the_parts_of_a_run_add_up(tmp_path: Path) -> None:
     assert 1000 <= run(spec(tmp_path, 30))["seconds"] < 2000
 
 
-def test_seed_that_diverges_ends_no_other(tmp_path: Path) -> None:
+def test_seconds_of_work_that_is_done_again_count_once(tmp_path: Path) -> None:
+    heading = "time/time_elapsed,time/total_timesteps\n"
+    # killed after step 30, gone on from the checkpoint at 20, killed again after 40, to go on from 30
+    (tmp_path / "progress_0.csv").write_text(f"{heading}100,10\n200,20\n300,30\n")
+    (tmp_path / "progress_20.csv").write_text(f"{heading}50,30\n,35\n90,40\n")
+    assert seconds_before(tmp_path, 30) == 250
+
+
+def test_diagnostics_are_the_last_ones_though_an_evaluation_came_later(tmp_path: Path) -> None:
+    (tmp_path / "progress_0.csv").write_text("eval/mean_reward,train/q_data\n,1.5\n,2.5\n7.0,\n")
+    (tmp_path / "progress_1500.csv").write_text("eval/mean_reward\n8.0\n")
+    assert last_metrics(tmp_path) == {"q_data": 2.5}
+
+
+def test_seed_that_diverges_ends_no_other(tmp_path: Path, legends: list[list[str]]) -> None:
     command = ["train", TINY, "--updates", "20", "--eval-freq", "10", "--eval-episodes", "1", "--workers", "1", *FAST]
     (tmp_path / "seed_0").mkdir(parents=True)
-    write_divergence(tmp_path / "seed_0", 7, "metrics not finite: train/q_data")
+    write_divergence(tmp_path / "seed_0", 17, "metrics not finite: train/q_data")
+    write_evaluations(tmp_path / "seed_0", [Evaluation(10, (1.0,), (5,), TINY)])
     outcome = sb3_dce(*command, "--seeds", "2", "--out", str(tmp_path))
     assert outcome.code == 2 and "metrics not finite" in outcome.stderr and "Traceback" not in outcome.stderr
     assert read_result(tmp_path / "seed_1") is not None and "seed_1/model.zip" in outcome.stdout
+    assert legends == [["dce"]], "the curve is that of the other alone"
+    assert f" {tmp_path / 'learning_curve.png'}\n" in outcome.stdout
+
+
+@pytest.fixture
+def workers() -> Iterator[_Workers]:
+    """A process for this thread; the first time that progress is to be shown, the disk of the log is full."""
+    shown: list[Progress] = []
+
+    def show(progress: Progress) -> None:
+        shown.append(progress)
+        if len(shown) == 1:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    made = _Workers(1, show)
+    yield made
+    made.close(at_once=True)
+
+
+def test_report_that_fails_is_no_fault_of_the_process_and_leaves_nothing_to_the_next_run(
+    workers: _Workers, tmp_path: Path
+) -> None:
+    with pytest.raises(OSError, match="No space left"):
+        workers.run(spec(tmp_path / "first", 1_000_000))
+    found = workers.run(spec(tmp_path / "second", 20))
+    assert found == read_result(tmp_path / "second") and found["n_updates"] == 20
+
+
+def half_a_message(end: Connection, threads: int, stop: Any) -> None:
+    """A process that is killed while it writes: the first four bytes of a message are its length."""
+    end.recv()
+    os.write(end.fileno(), struct.pack("!i", 100) + b"half")
+    os._exit(1)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="pipes have another form")
+def test_process_that_is_killed_in_the_middle_of_a_message_is_replaced(
+    workers: _Workers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launch, "_serve", half_a_message)
+    for _ in range(2):
+        with pytest.raises(RunFailedError, match="was ended from outside"):
+            workers.run(spec(tmp_path, 20))
+    assert len({process.pid for process in workers._processes}) == 2
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -15,14 +16,16 @@ import gymnasium as gym
 import h5py
 import numpy as np
 import pytest
+from commands import sb3_dce
 from gymnasium import spaces
 from minari_files import Hub, Steps, box, episode, record, write_dataset
 
 from sb3_dce import OfflineDCE, cli
 from sb3_dce.data import Transitions, find_file, load_transitions, normalized_score
-from sb3_dce.data.locate import catalogue_id
+from sb3_dce.data.hashes import data_sha256, file_sha256, sha256_once
+from sb3_dce.data.locate import catalogue_id, is_path, known_dataset, short_name
 from sb3_dce.data.minari_download import download_minari
-from sb3_dce.envs import SpacesEnv, make_minari_env, own_env
+from sb3_dce.envs import SpacesEnv, make_minari_env, own_env, without_bookkeeping
 from sb3_dce.errors import (
     ConfigError,
     DatasetError,
@@ -306,6 +309,30 @@ def test_replayed_adroit_sets_say_that_their_rewards_deserve_a_look(root: Path) 
 def test_a_path_is_as_good_as_a_name(root: Path, way: str) -> None:
     path = dataset(root, episode(3), dataset_id="own/set-v0")
     assert load_transitions(path / way).info.id == load_transitions("minari:own/set-v0").info.id == "minari:own/set-v0"
+    assert find_file(path / way) == find_file("minari:own/set-v0") == (path / "data/main_data.hdf5", None)
+    assert short_name(path / way) == short_name("minari:own/set-v0") == "own-set-v0"
+
+
+def test_a_folder_beside_the_user_needs_no_separator(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = dataset(root, episode(3))
+    monkeypatch.chdir(path.parent)
+    assert is_path("set-v0") and find_file("set-v0")[0].samefile(path / "data/main_data.hdf5")
+    monkeypatch.chdir(path)
+    assert short_name("data") == short_name("data/main_data.hdf5") == "set-v0"
+
+
+def test_no_folder_of_minari_passes_for_a_set_of_the_catalogue(root: Path) -> None:
+    path = write_dataset(root / "hopper-medium-v2", {"episode_0": episode(3)})
+    assert find_file(path)[1] is known_dataset(path) is None
+
+
+def test_command_trains_on_a_folder(pendulum: tuple[Path, Steps], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    settings = ("--set", "policy_kwargs={net_arch: [8]}", "--set", "batch_size=16")
+    steps = ("--updates", "2", "--eval-freq", "2", "--eval-episodes", "1", "--seeds", "1")
+    outcome = sb3_dce("train", str(pendulum[0] / "test/pendulum/random-v0"), "--algo", "bc", *steps, *settings)
+    assert outcome.code == 0, outcome
+    assert (tmp_path / "runs/offline_bc-test-pendulum-random-v0/seed_0/result.json").is_file()
 
 
 def test_rows_are_kept_if_asked_for(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -326,6 +353,26 @@ def test_the_hash_is_that_of_the_data(root: Path) -> None:
     with h5py.File(path / "data/main_data.hdf5", "a") as file:
         file["episode_0/rewards"][0] += 1
     assert load_transitions(path).info.sha256 != first and first is not None
+
+
+@pytest.mark.parametrize("data_format", ["arrow", "parquet"])
+def test_the_hash_of_a_file_per_episode_is_that_of_all_files(root: Path, tmp_path: Path, data_format: str) -> None:
+    pytest.importorskip("pyarrow")
+    record(gym.make("Pendulum-v1", max_episode_steps=10), "pendulum-v0", 2, data_format=data_format)
+    path, twin = find_file("minari:pendulum-v0")[0], tmp_path / "twin"
+    info = load_transitions("minari:pendulum-v0").info
+    shutil.copytree(path.parent, twin)
+    (twin / ".hidden").mkdir()
+    (twin / ".hidden/file").touch()
+    first = sha256_once(path)
+    assert first == data_sha256(path) == load_transitions(twin).info.sha256
+    part = next((path.parent / "1").glob(f"*.{data_format}"))
+    part.rename(part.with_name(f"other.{data_format}"))
+    renamed = data_sha256(path)
+    (path.parent / "0" / part.name).write_bytes(part.with_name(f"other.{data_format}").read_bytes())
+    assert len({first, renamed, sha256_once(path)}) == 3 and file_sha256(path) == file_sha256(twin / path.name)
+    with pytest.raises(DatasetIntegrityError, match="changed since it was read"):
+        _ = info.sha256
 
 
 def test_a_dataset_that_is_not_here_is_said_without_network(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -466,11 +513,19 @@ def test_nothing_that_metadata_name_is_imported_or_passed_on(
 
 
 def test_environment_for_evaluation_is_gymnasiums_own_entry(root: Path) -> None:
-    """Of a known id only the id counts: the entry point beside it is not looked at."""
+    """Of a known id only the id and the time limit count: the entry point beside it is not looked at."""
     spec = {"id": "Pendulum-v1", "entry_point": "evil_of_minari:Env", "kwargs": {}, "max_episode_steps": 7}
     dataset(root, episode(3), env_spec=json.dumps({"id": "CartPole-v1"}), eval_env_spec=json.dumps(spec))
     env = make_minari_env("minari:own/set-v0")
-    assert env is not None and env.spec is not None and env.spec.id == "Pendulum-v1" and env.spec.max_episode_steps == 200
+    assert env is not None and env.spec is not None and env.spec.id == "Pendulum-v1" and env.spec.max_episode_steps == 7
+
+
+@pytest.mark.parametrize(("recorded", "limit"), [(7, 7), (300, 300), (None, 200), (0, 200), ("7", 200)])
+def test_episodes_are_as_long_as_those_of_the_recording(root: Path, recorded: object, limit: int) -> None:
+    spec = {"id": "Pendulum-v1", "kwargs": {}, "max_episode_steps": recorded}
+    dataset(root, episode(3), env_spec=json.dumps(spec))
+    env = make_minari_env("minari:own/set-v0")
+    assert env is not None and without_bookkeeping(env)[1] == limit
 
 
 @pytest.mark.parametrize("way", ["", "data/main_data.hdf5"])

@@ -15,6 +15,7 @@ from agents_under_test import AGENTS
 
 from sb3_dce import OfflineCQL, OfflineDCE, OfflineIQL, OfflinePBRL, OfflineSAC, OfflineTD3BC, OfflineUWAC, Transitions
 from sb3_dce.base import OfflineAlgorithm
+from sb3_dce.errors import ConfigError
 from sb3_dce.noise import NoiseSpec
 
 NORMAL, UNIFORM = ("normal", 0.0), ("uniform", 0.0)
@@ -45,6 +46,11 @@ def test_random_numbers_have_the_distribution_they_should(
         (pattern,) = (pattern for pattern in expected if re.fullmatch(pattern, name))
         assert (spec.kind, spec.rate) == expected[pattern], name
     assert all(any(re.fullmatch(pattern, name) for name in specs) for pattern in expected)
+
+
+def test_unknown_kind_of_noise_is_refused() -> None:
+    with pytest.raises(ConfigError, match="kind must be one of 'normal', 'uniform', 'dropout', got 'gaussian'"):
+        NoiseSpec("gaussian", (2,))
 
 
 def test_every_agent_is_listed() -> None:

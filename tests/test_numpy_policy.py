@@ -159,6 +159,12 @@ def test_iql_noise_is_added_to_the_squashed_mean_and_clipped(wide_data: Transiti
     assert np.abs(twin(model).act(OBS, noise) - expected).max() <= TOLERANCE
 
 
+def test_noise_is_added_to_the_squashed_mean_also_where_the_spread_is_a_layer() -> None:
+    mlp = random_mlp()
+    policy = MLPPolicy(mlp.layers, "relu", mlp.low, mlp.high, squash="mean", log_std=mlp.log_std)
+    assert np.allclose(policy.act(OBS, np.zeros((40, 2))), policy.act(OBS), rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_zip_file_names_its_algorithm(zips: dict[str, Path], models: dict[str, Any], algo: str) -> None:
     assert detect_algo(zips[algo]) == ("td3" if algo == "ddpg" else algo)  # a DDPG model is a TD3 model

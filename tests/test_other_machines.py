@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,8 +14,8 @@ import torch as th
 
 import sb3_dce
 from sb3_dce import OfflineDCE, execution, load_dataset
-from sb3_dce.data import available, find_file, locate
-from sb3_dce.errors import ConfigError, DatasetNotFoundError, SB3DCEWarning
+from sb3_dce.data import available, find_file, locate, memory
+from sb3_dce.errors import ConfigError, DatasetNotFoundError, DatasetWarning, SB3DCEWarning
 from sb3_dce.evaluation import evaluate
 from sb3_dce.processes import usable_cores
 from sb3_dce.rollouts import make_rollouts
@@ -61,10 +62,52 @@ def test_no_home_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None
     assert locate.search_folders() == [tmp_path]
 
 
+def test_rows_are_kept_without_a_home_folder_where_there_is_a_place(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(Path, "expanduser", _no_home)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    copy = shutil.copy(find_file(TINY)[0], tmp_path / "mine.hdf5")
+    assert len(load_dataset(copy, cache=True)) > 0 and len(list((tmp_path / ".sb3_dce_rows").iterdir())) == 2
+    with pytest.warns(DatasetWarning, match=r"rows not kept.*no home folder"):
+        assert len(load_dataset(TINY, cache=True)) > 0
+
+
 def _no_home(path: Path) -> Path:
     if str(path).startswith("~"):
         raise RuntimeError("Could not determine home directory.")
     return path
+
+
+@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize(
+    ("limits", "free"),
+    [
+        ({}, 1_024_000),  # what the machine has
+        ({"": 900_000}, 600_000),  # 900,000 less 400,000, of which 100,000 are pages of files
+        ({"job": 700_000, "": 900_000}, 400_000),
+        ({"job": 2**63 - 4096}, 1_024_000),
+        ({"job/step": 300_000}, 0),
+    ],
+    ids=str,
+)
+def test_free_memory_is_what_a_container_or_a_batch_job_leaves(
+    version: int, limits: dict[str, int], free: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    proc, groups = tmp_path / "proc", tmp_path / "cgroup"
+    (proc / "self").mkdir(parents=True)
+    (proc / "meminfo").write_text("MemTotal: 2000 kB\nMemAvailable: 1000 kB\n")
+    lines = {1: "5:cpu,cpuacct:/elsewhere\n4:memory:/job/step\n", 2: "0::/job/step\n"}
+    (proc / "self/cgroup").write_text(lines[version])
+    limit, usage = {1: ("limit_in_bytes", "usage_in_bytes"), 2: ("max", "current")}[version]
+    prefix, root = {1: ("total_", groups / "memory"), 2: ("", groups)}[version]
+    for name in ("job/step", "job", ""):
+        (root / name).mkdir(parents=True, exist_ok=True)
+        (root / name / f"memory.{limit}").write_text(f"{limits.get(name, 'max')}\n")
+        (root / name / f"memory.{usage}").write_text("400000\n")
+        counts = f"{prefix}active_file 60000\n{prefix}inactive_file 40000\n"
+        (root / name / "memory.stat").write_text(f"anon 1\n{counts}")
+    monkeypatch.setattr(memory, "PROC", proc)
+    monkeypatch.setattr(memory, "CONTROL_GROUPS", groups)
+    assert memory.free_memory() == free
 
 
 def test_a_folder_that_may_not_be_read_is_passed_over(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ MEMBERS: list[dict[str, Any]] = [
 
 def make(data: Transitions, agent: type[OfflineAlgorithm] = OfflineDCE, **kwargs: Any) -> OfflineAlgorithm:
     settings = {"batch_size": 8, "learning_rate": 1e-3, "execution": "eager", "policy_kwargs": {"net_arch": [16, 16]}}
-    model = agent("MlpPolicy", dataset=data, **{**settings, **kwargs})
+    model = agent(**{"policy": "MlpPolicy", "dataset": data, **settings, **kwargs})
     model.attach_dataset()
     return to_float64(model)
 
@@ -228,6 +228,18 @@ def test_members_of_other_kinds_and_stages_are_refused(data: list[Transitions]) 
         Population([make(data[0]), alone(make(data[0]), 1)])
     with pytest.raises(ConfigError, match="at least one"):
         Population([])
+
+
+def test_members_with_networks_of_another_kind_are_refused(data: list[Transitions]) -> None:
+    class OtherPolicy(OfflineDCE.policy_aliases["MlpPolicy"]):  # type: ignore[misc]
+        pass
+
+    first, other, tanh = make(data[0]), make(data[0], policy=OtherPolicy), make(data[0])
+    tanh.critic.q_networks[0][1] = th.nn.Tanh()
+    with pytest.raises(ConfigError, match=r"member 1 .* policy is <class .*OtherPolicy'>, not <class"):
+        Population([first, other])
+    with pytest.raises(ConfigError, match=r"policy is <class .*Tanh'>, not <class .*ReLU'>"):
+        Population([first, tanh])
 
 
 def test_memory_is_known_beforehand(data: list[Transitions]) -> None:

@@ -17,13 +17,13 @@ from rich.console import Console
 from update_tools import all_tensors, largest_difference
 
 from sb3_dce import OfflineDCE
-from sb3_dce.errors import ConfigError, DivergenceError
+from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError
 from sb3_dce.evaluation import read_evaluations
-from sb3_dce.evaluation_pool import EvaluationPool
+from sb3_dce.evaluation_pool import EvaluationPool, PendingEpisodes
 from sb3_dce.population import Population
 from sb3_dce.population_runs import STATE_FILE, BatchedRuns, train_population
-from sb3_dce.run_files import RunSpec, read_divergence
-from sb3_dce.runs import run
+from sb3_dce.run_files import RunSpec, progress_logs, read_divergence, read_result, write_divergence
+from sb3_dce.runs import StoppedError, alone, run
 
 TINY = "halfcheetah-tiny-sb3"
 QUICK = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 16}
@@ -128,12 +128,109 @@ def test_population_goes_on_without_the_member_that_diverged(tmp_path: Path, mon
     assert not list(tmp_path.rglob("checkpoint_*")) and not (tmp_path / "killed" / STATE_FILE).exists()
 
 
+def test_member_that_diverged_before_stays_as_it_is(tmp_path: Path) -> None:
+    members = specs(tmp_path)
+    folder = Path(members[1].folder)
+    folder.mkdir()
+    write_divergence(folder, 7, "q_data not finite")
+    for _ in range(2):
+        with pytest.raises(DivergenceError, match=r"1 of 2 members diverged: dce seed 1 \(update 7\)"):
+            BatchedRuns(members, CPU, "eager", Console(quiet=True)).run()
+    assert [path.name for path in folder.iterdir()] == ["diverged.json"]
+    ended = read_divergence(folder)
+    assert ended is not None and ended["reason"] == "q_data not finite"
+    assert read_result(tmp_path / "seed_0") is not None
+
+
+def test_population_that_is_refused_touches_no_file(tmp_path: Path) -> None:
+    batched(tmp_path, n_updates=20).run()
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    with alone(tmp_path / "seed_1"), pytest.raises(CheckpointError, match="another process is at this run"):
+        batched(tmp_path, n=3).run()
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    assert not (tmp_path / "seed_2").exists()
+    mixed = specs(tmp_path / "new" / "mixed")
+    mixed[1].overrides["batch_size"] = 8
+    with pytest.raises(ConfigError, match="batch_size"):
+        BatchedRuns(mixed, CPU, "eager", Console(quiet=True)).run()
+    assert not (tmp_path / "new").exists()
+
+
+def test_population_that_another_process_completed_meanwhile_is_not_trained_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def late(folder: Path) -> Any:
+        monkeypatch.undo()
+        batched(tmp_path, n_updates=20).run()
+        return alone(folder)
+
+    monkeypatch.setattr("sb3_dce.population_runs.alone", late)
+    with monkeypatch.context() as patch:
+        second = batched(tmp_path, n_updates=20)
+        patch.setattr(second, "_population", None)
+        assert [result["n_updates"] for result in second.run()] == [20, 20]
+
+
+def test_run_that_was_interrupted_alone_is_not_begun_anew(tmp_path: Path) -> None:
+    first, *_ = specs(tmp_path)
+    with pytest.raises(StoppedError):
+        run(first, stop=lambda: True)
+    before = (tmp_path / "seed_0" / "progress_0.csv").read_bytes()
+    with pytest.raises(ConfigError, match=r"runs of their own.*: seed_0.*delete their checkpoint\.zip"):
+        batched(tmp_path).run()
+    assert (tmp_path / "seed_0" / "progress_0.csv").read_bytes() == before and not (tmp_path / "seed_1").exists()
+    assert run(first)["n_updates"] == 40
+    assert [result["n_updates"] for result in batched(tmp_path).run()] == [40, 40]
+
+
+def test_checkpoint_of_a_run_of_its_own_does_not_outlive_the_population(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(BatchedRuns, "_finish", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        batched(tmp_path, n_updates=20).run()
+    first, *_ = specs(tmp_path, n_updates=20)
+    with pytest.raises(StoppedError):
+        run(first, stop=lambda: True)
+    assert batched(tmp_path, n_updates=20).run() and not (tmp_path / "seed_0" / "checkpoint.zip").exists()
+
+
+def test_nothing_of_a_training_that_is_begun_anew_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    original = BatchedRuns._save
+
+    def stop_at(n_updates: int) -> None:
+        def save(self: BatchedRuns, population: Any, seconds: float) -> None:
+            original(self, population, seconds)
+            if population.n_updates == n_updates:
+                raise KeyboardInterrupt
+
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(BatchedRuns, "_save", save)
+            batched(tmp_path, n_updates=60).run()
+
+    for n_updates in (20, 40):
+        stop_at(n_updates)
+    folder = tmp_path / "seed_0"
+    assert [e.n_updates for e in read_evaluations(folder, None)] == [20, 40]
+    (tmp_path / STATE_FILE).write_bytes(b"no state")
+    stop_at(20)
+    assert [n for n, _ in progress_logs(folder)] == [0]
+    assert [e.n_updates for e in read_evaluations(folder, None)] == [20]
+
+
+def test_begun_anew_a_member_has_no_evaluations_before_its_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    batched(tmp_path, n_updates=20).run()
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Population, "train", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        batched(tmp_path, n_updates=40).run()
+    assert read_evaluations(tmp_path / "seed_0", None) == []
+
+
 def test_members_write_tensorboard_logs_of_their_own(tmp_path: Path) -> None:
     pytest.importorskip("tensorboard")
     batched(tmp_path / "runs", n_updates=20, tensorboard_log=str(tmp_path / "tb")).run()
-    names = [f"dce_{TINY}_{seed}" for seed in range(2)]
-    assert sorted(path.name for path in (tmp_path / "tb").iterdir()) == names
-    assert all(list((tmp_path / "tb" / name).glob("events.*")) for name in names)
+    assert all(list((tmp_path / "tb").glob(f"dce_{TINY}_{seed}_*/events.*")) for seed in range(2))
+    assert len(list((tmp_path / "tb").iterdir())) == 2
 
 
 @pytest.mark.parametrize("n_before", [13, 20])  # in the middle, and before the evaluation that is due
@@ -186,6 +283,28 @@ def test_evaluation_in_a_worker_is_kept_if_the_run_is_killed_at_its_end(
             BatchedRuns(specs(tmp_path, n_updates=50), CPU, "eager", Console(quiet=True), workers=1).run()
     BatchedRuns(specs(tmp_path, n_updates=50), CPU, "eager", Console(quiet=True), workers=1).run()
     assert [e.n_updates for e in read_evaluations(tmp_path / "seed_0", None)] == [20, 40]
+
+
+def test_evaluation_that_is_waited_for_during_an_interruption_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    submit, result = EvaluationPool.submit, PendingEpisodes.result
+    interruptions = [KeyboardInterrupt()]
+
+    def beside(self: EvaluationPool, model: Any, rollouts: Any, seed: int, parts: int = 1) -> Any:
+        return submit(EvaluationPool(0), model, rollouts, seed)
+
+    def interrupted(self: PendingEpisodes) -> Any:
+        if interruptions:
+            raise interruptions.pop()
+        return result(self)
+
+    monkeypatch.setattr(EvaluationPool, "submit", beside)
+    monkeypatch.setattr(PendingEpisodes, "result", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        BatchedRuns(specs(tmp_path), CPU, "eager", Console(quiet=True), workers=1).run()
+    assert (tmp_path / "seed_0" / "checkpoint_40.zip").exists()
+    BatchedRuns(specs(tmp_path), CPU, "eager", Console(quiet=True), workers=1).run()
+    for folder in (tmp_path / "seed_0", tmp_path / "seed_1"):
+        assert [e.n_updates for e in read_evaluations(folder, None)] == [20, 40]
 
 
 def test_two_populations_share_a_folder_by_names_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -300,6 +300,9 @@ def test_folder_that_cannot_be_written_is_said_at_once(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(CheckpointError, match="cannot write"):
         record(RANDOM, tmp_path / "file" / "x.hdf5", n_rows=10**9)
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(CheckpointError, match=r"folder: a folder is no file to write\. Name a file in it"):
+        record(RANDOM, tmp_path / "folder", n_rows=10**9)
 
 
 @pytest.mark.parametrize(
@@ -357,6 +360,34 @@ def test_nan_of_the_simulator_is_never_written(exploding_env: str, tmp_path: Pat
     with pytest.raises(DatasetSemanticsError, match=r"NaN.*episode 0"):
         record(RecordingSpec("random", exploding_env, max_episode_steps=5), tmp_path / "x.hdf5", n_rows=10)
     assert list(tmp_path.iterdir()) == []
+
+
+class Reuses(gym.Env):
+    """Returns its own array as observation, and limits the action in place."""
+
+    observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    action_space: ClassVar[spaces.Box] = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.state = np.zeros(1)
+        return self.state, {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        reward = float(action[0])
+        np.clip(action, -0.1, 0.1, out=action)
+        self.state += 1.0
+        return self.state, reward, False, False, {}
+
+
+def test_arrays_that_the_environment_overwrites_are_recorded_as_they_were() -> None:
+    gym.registry.pop("Reuses-v0", None)
+    gym.register("Reuses-v0", entry_point=Reuses)
+    spec = RecordingSpec("random", "Reuses-v0", max_episode_steps=5, next_observations=True)
+    arrays = EpisodeRunner(spec).run(0)
+    assert arrays["observations"].ravel().tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert arrays["next_observations"].ravel().tolist() == [1.0, 2.0, 3.0, 4.0, 5.0]
+    assert np.array_equal(arrays["actions"].ravel(), arrays["rewards"]) and np.abs(arrays["actions"]).max() > 0.1
 
 
 def test_wrappers_that_change_rewards_stay() -> None:

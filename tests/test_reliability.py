@@ -358,6 +358,25 @@ def test_what_killed_writers_left_is_removed_by_the_next_one(tmp_path: Path) -> 
     assert left == {"model.zip", young.name, other.name, ours.name}
 
 
+@pytest.mark.skipif(os.name == "nt", reason="not everybody may make links there")
+@pytest.mark.parametrize("there", [True, False])
+def test_link_to_a_file_stays_one(there: bool, tmp_path: Path) -> None:
+    link, file = tmp_path / "page.md", tmp_path / "elsewhere" / "page.md"
+    link.symlink_to(Path("elsewhere") / "page.md")
+    if there:
+        files.write_text(file, "old")
+    files.check_writable(link)
+    files.write_text(link, "new")
+    assert link.is_symlink() and file.read_text() == "new" and len(list(file.parent.iterdir())) == 1
+
+
+def test_names_that_can_be_no_file_are_refused_before_the_work(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="a folder is no file to write"):
+        files.check_writable(tmp_path)
+    with pytest.raises(CheckpointError, match="cannot write"):
+        files.check_writable(tmp_path / ("x" * 300) / "model.zip")
+
+
 # -- surroundings ------------------------------------------------------------------------------------------------------
 
 

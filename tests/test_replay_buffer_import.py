@@ -125,6 +125,22 @@ def test_dataset_has_the_bounds_of_the_action_space() -> None:
     assert transitions.info.action_high[1] > 1
 
 
+@pytest.mark.parametrize(
+    ("options", "low", "high"),
+    [
+        ({"action_scale": 12.0}, [-12, -12], [12, 12]),
+        ({"action_low": -3.0}, [-3, -3], [2, 10]),
+        ({"action_low": None, "action_high": [4.0, 20.0]}, [-2, 0], [4, 20]),
+    ],
+    ids=str,
+)
+def test_bounds_that_the_user_names_win_over_the_action_space(options: Any, low: list[int], high: list[int]) -> None:
+    buffer = ReplayBuffer(100, OBSERVATIONS, WIDE, device="cpu")
+    fill(buffer, 60, WIDE)
+    info = Transitions.from_replay_buffer(buffer, **options).info
+    assert (info.action_space_low.tolist(), info.action_space_high.tolist()) == (low, high)
+
+
 @pytest.mark.parametrize("n_steps", [7, 40, 95])
 def test_offline_replay_buffer_filled_by_add(n_steps: int) -> None:
     buffer = OfflineReplayBuffer(40, OBSERVATIONS, WIDE, device="cpu")

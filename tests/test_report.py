@@ -72,7 +72,7 @@ def test_noise_of_a_gaussian_policy_is_found(n_dims: int, sigma: float) -> None:
     behaviour = estimated(gaussian_policy(n_dims, sigma))
     expected = sigma / 4.0  # the bounds +-4 are scaled to +-1
     assert behaviour.std == pytest.approx(expected, rel=0.15)
-    assert (behaviour.nearest_std >= 0.9 * behaviour.std).all()
+    assert (behaviour.nearest_std >= behaviour.std).all()
     assert behaviour.entropy == pytest.approx(2 * 0.5 * np.log(2 * np.pi * np.e * expected**2), abs=0.3)
     assert behaviour.mean_std == pytest.approx(expected, rel=0.15)
 
@@ -89,6 +89,14 @@ def test_uniform_actions_have_the_entropy_of_the_uniform_distribution() -> None:
     behaviour = estimated(episodes_of(rng.standard_normal((8_000, 2)), rng.uniform(-1, 1, (8_000, 3))))
     assert behaviour.std == pytest.approx(1 / np.sqrt(3), rel=0.05)
     assert behaviour.entropy == pytest.approx(3 * np.log(2.0), abs=0.1)
+
+
+def test_estimate_is_not_above_that_of_the_nearest_neighbours() -> None:
+    # Pairs of near states have one action; those that are farther away have nothing in common, so that no line fits.
+    rng = np.random.default_rng(0)
+    states, actions = rng.standard_normal((4_000, 2)), rng.uniform(-1, 1, (4_000, 1))
+    behaviour = estimated(episodes_of(np.concatenate([states, states + 1e-4]), np.concatenate([actions, actions])))
+    assert behaviour.std == behaviour.nearest_std < 0.01
 
 
 def test_copied_rows_do_not_pass_for_determinism() -> None:
@@ -426,7 +434,8 @@ def _wide() -> dict[str, np.ndarray]:
 
 def _open() -> dict[str, np.ndarray]:
     none = np.zeros(200, dtype=bool)
-    return base_arrays() | {"timeouts": none, "terminals": none}
+    arrays = base_arrays() | {"timeouts": none, "terminals": none}
+    return {key: array for key, array in arrays.items() if key != "next_observations"}  # whose jumps would show the ends
 
 
 def _constant() -> dict[str, np.ndarray]:

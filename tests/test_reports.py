@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +15,15 @@ from sb3_dce.experiments import results
 from sb3_dce.experiments.captions import caption
 from sb3_dce.experiments.claims import claim_table, own_table_facts
 from sb3_dce.experiments.curves import panel_curves
-from sb3_dce.experiments.diagnosis import variant_table
+from sb3_dce.experiments.diagnosis import diagnostics_table, variant_table
 from sb3_dce.experiments.evidence import Evidence
-from sb3_dce.experiments.figures import draw_profile
-from sb3_dce.experiments.grid import experiment_ids, load_experiment, variant_hash
+from sb3_dce.experiments.figures import draw, draw_profile
+from sb3_dce.experiments.grid import EMBEDDED, experiment_ids, load_experiment, variant_hash
 from sb3_dce.experiments.judging import CLOSE, HELD, NOT_HELD, UNTESTED, Verdict
 from sb3_dce.experiments.pages import coverage
 from sb3_dce.experiments.reports import config_table, make_report, toy_table
 from sb3_dce.experiments.run_times import runtime_table
-from sb3_dce.experiments.tables import aggregate_tables, common_rows, score_table
+from sb3_dce.experiments.tables import aggregate_tables, common_rows, long_table, score_table
 from sb3_dce.experiments.text_table import TextTable
 from sb3_dce.experiments.verdicts import verdicts
 from sb3_dce.theory import shift_factor
@@ -45,6 +46,11 @@ def cell(table: TextTable, row: str, column: str) -> str:
 def scores(**changes: list[float]) -> dict[str, list[float]]:
     # where the commonest row is the dataset's own, "DCE" and "one setting" are one run
     return {**{name: [40.0, 42.0, 44.0] for name in AGENTS}, **changes}
+
+
+def diverged(variant: str, dataset: str, seed: int, n_updates: int = 1000) -> pd.DataFrame:
+    row = run_rows(TABLE, variant, dataset, seed, n_updates=n_updates).iloc[:1]
+    return row.assign(metric="diverged", step=300, value=1.0)
 
 
 def test_cells_are_mean_and_deviation_over_seeds_beside_the_papers() -> None:
@@ -137,7 +143,7 @@ def test_totals_are_of_data_of_one_length() -> None:
 
 def test_what_is_left_of_an_agent_that_diverged_has_no_total_and_is_ahead_of_nobody() -> None:
     rows = table_rows(TABLE, {name: scores(CQL=[90.0, 91.0, 92.0], BC=[1.0] * 3) for name in HALFCHEETAHS})
-    lost = run_rows(TABLE, "CQL", CHEETAH, 3).iloc[:1].assign(metric="diverged", step=300, value=1.0)
+    lost = diverged("CQL", CHEETAH, 3)
     evidence = evidence_of(results.merge([rows, lost]))
     assert cell(score_table(evidence), CHEETAH, "ours: CQL") == "91.0 ± 1.0 (1 diverged)", "not bold"
     totals = {row[0]: row[1:] for row in aggregate_tables(evidence)["sb3"].rows}
@@ -151,14 +157,20 @@ def test_what_is_left_of_an_agent_that_diverged_has_no_total_and_is_ahead_of_nob
 def test_runs_without_scores_and_agents_that_all_diverged_are_no_error(tmp_path: Path) -> None:
     unscored = table_rows(TABLE, {CHEETAH: scores()}).query("metric != 'score'")
     assert make_report(evidence_of(unscored)).tables.keys() >= {"scores"} and not common_rows(evidence_of(unscored), "sb3")
-    lost = [
-        run_rows(TABLE, v.name, CHEETAH, 0).iloc[:1].assign(metric="diverged", step=300, value=1.0) for v in TABLE.variants
-    ]
+    lost = [diverged(v.name, CHEETAH, 0) for v in TABLE.variants]
     evidence = evidence_of(results.merge(lost))
     assert {cell for row in aggregate_tables(evidence)["sb3"].rows for cell in row[1:]} == {"-"}
     assert draw_profile(evidence, "sb3", tmp_path, "profile") == []
     (finding,) = [row[-1] for row in variant_table(evidence_of(results.merge(lost), "why-dce-loses")).rows]
     assert finding == "DCE diverged on 1 of 1 seeds"
+
+
+def test_course_of_the_score_is_empty_where_it_has_no_numbers() -> None:
+    nan, columns = float("nan"), ("score at 40 to 60 %", "score at the end")
+    for course, expected in (([1.0, nan, nan, 4.0, nan], ["-", "-"]), ([1.0, 2.0, nan, 4.0, 5.0], ["2", "5"])):
+        rows = run_rows(load_experiment("why-dce-loses"), "DCE", CHEETAH, 0, curves={"score": course})
+        table = diagnostics_table(evidence_of(rows, "why-dce-loses"))
+        assert [cell(table, CHEETAH, column) for column in columns] == expected
 
 
 def test_agent_with_runs_of_another_length_alone_is_shown_with_it_and_compared_with_nobody() -> None:
@@ -172,12 +184,26 @@ def test_agent_with_runs_of_another_length_alone_is_shown_with_it_and_compared_w
     assert cell(table, "walker2d-medium-sb3", "ours: BC") == "**42.0 ± 2.0**"
     assert "PBRL" not in {row[0] for row in aggregate_tables(evidence)["sb3"].rows}
     assert {row[0]: row[2] for row in runtime_table(evidence).rows}["PBRL"] == "2.0"
-    assert (
-        evidence_of(results.merge([long, short]), n_updates=50_000).last_of_other_length(
-            TABLE.variant("PBRL"), "walker2d-medium-sb3"
-        )
-        is None
-    ), "a length that was asked for is the only one"
+    only = evidence_of(results.merge([long, short]), n_updates=50_000)
+    assert cell(score_table(only), "walker2d-medium-sb3", "ours: PBRL") == "-", "a length that was asked for is the only one"
+
+
+def test_runs_of_another_length_that_diverged_are_counted() -> None:
+    others = {name: values for name, values in scores().items() if name not in ("PBRL", "CQL")}
+    lost = [diverged(name, CHEETAH, 3, n_updates=10_000) for name in ("PBRL", "CQL")]
+    short = table_rows(TABLE, {CHEETAH: {"PBRL": [90.0, 92.0]}}, n_updates=10_000)
+    table = score_table(evidence_of(results.merge([table_rows(TABLE, {CHEETAH: others}, n_updates=50_000), short, *lost])))
+    assert cell(table, CHEETAH, "ours: PBRL") == "91.0 ± 1.4 (after 10,000, 2 seeds, 1 diverged)"
+    assert cell(table, CHEETAH, "ours: CQL") == "(1 diverged, after 10,000)"
+
+
+def test_all_columns_of_the_long_table_are_over_the_same_seeds() -> None:
+    runs = [run_rows(TABLE, "DCE", CHEETAH, seed, curves={"score": [seed + 10.0 * i for i in range(12)]}) for seed in (0, 1)]
+    best = run_rows(TABLE, "DCE", CHEETAH, 2, curves={"score": [500.0] * 12}).query("step < 900 and metric == 'score'")
+    table = long_table(evidence_of(results.merge([*runs, pd.concat([best, diverged("DCE", CHEETAH, 2)])])))
+    (row,) = [dict(zip(table.header, cells, strict=True)) for cells in table.rows if cells[2] == "DCE"]
+    assert (row["n_seeds"], row["n_diverged"], row["scores"]) == ("2", "1", "110.0000 111.0000")
+    assert (row["mean"], row["mean_best_evaluation"], row["mean_last_10_evaluations"]) == ("110.5000", "110.5000", "65.5000")
 
 
 def test_totals_have_the_papers_sum_of_deviations_beside_the_honest_one() -> None:
@@ -221,6 +247,18 @@ def test_run_times_of_precisions_stand_in_rows_of_their_own() -> None:
         ("DCE", "cpu", "11.0", "10.0 to 12.0", "3"),
         ("DCE", "cpu bf16-matmul", "13.0", "13.0 to 13.0", "1"),
     ]
+
+
+def test_run_times_of_different_lengths_are_shown_and_not_compared() -> None:
+    experiment = load_experiment("run-times")
+    seconds = {"BC": 2.0, "IQL": 8.0, "CQL": 90.0, "UWAC": 400.0}
+    parts = [run_rows(experiment, name, CHEETAH, 0, 40.0, seconds=value) for name, value in seconds.items()]
+    compiled = run_rows(experiment, "DCE", CHEETAH, 0, 40.0, seconds=600.0, n_updates=50_000)
+    evidence = evidence_of(results.merge([*parts, compiled]), "run-times")
+    assert cell(runtime_table(evidence), "DCE", "s per 1000 updates (median)") == "12.0"
+    order, far = verdicts(evidence)
+    (faster,) = [row for row in claim_table({"run-times": evidence}, {}).rows if row[0] == "C3"]
+    assert (order.outcome, far.outcome, faster[2]) == (UNTESTED, HELD, UNTESTED)
 
 
 def test_figure_without_a_line_is_none_though_there_are_runs_of_its_data() -> None:
@@ -275,6 +313,24 @@ def test_a_panel_is_as_long_as_its_own_lines(tmp_path: Path) -> None:
     assert {("beta 2", "100"), ("BC", "100")} <= lengths
     only = caption(evidence, [CHEETAH], [experiment.variant("beta 2"), experiment.variant("BC")])
     assert f"Further runs, of other lengths: 1 of 200 steps on {CHEETAH}." in only
+
+
+def texts_of(name: str, rows: pd.DataFrame, folder: Path) -> list[str]:
+    """What is written in the figure at smoke scale; its SVG has each text in a comment beside the letters' outlines."""
+    experiment = load_experiment(name)
+    (picture,) = [
+        path for path in draw(Evidence(experiment, rows, experiment.scales["smoke"]), folder, name) if path.suffix == ".svg"
+    ]
+    return re.findall(r"<!-- (.*) -->", picture.read_text())
+
+
+def test_panel_without_a_curve_has_the_name_of_the_data_that_the_scale_would_take(tmp_path: Path) -> None:
+    titles = [text for text in texts_of("fig-beta", results.empty(), tmp_path) if "halfcheetah" in text]
+    assert titles and all(title.startswith(EMBEDDED) for title in titles)
+    alpha = load_experiment("fig-alpha")
+    curves = {"ent_coef": [0.1] * 4}
+    rows = run_rows(alpha, "beta 4", EMBEDDED, 0, curves=curves, n_updates=200, scale=alpha.scales["smoke"])
+    assert not [text for text in texts_of("fig-alpha", rows, tmp_path) if re.search("(sb3|v2): no curve", text)]
 
 
 def test_markdown_latex_and_csv_have_the_same_cells() -> None:
@@ -342,6 +398,13 @@ def test_claims_on_places_are_not_tested_on_d4rl_and_own_data_together() -> None
         rows = table_rows(TABLE, {name: scores(DCE=[90.0, 91.0, 92.0]) for name in names})
         outcomes.append(claim_of(rows, "C4").outcome)
     assert outcomes == [UNTESTED, HELD]
+
+
+def test_claims_on_places_rest_on_the_files_with_more_of_the_sets() -> None:
+    ours = {name: scores(DCE=[90.0, 91.0, 92.0]) for name in HALFCHEETAHS}
+    theirs = {name.replace("-sb3", "-v2"): scores(DCE=[1.0, 2.0, 3.0]) for name in HALFCHEETAHS}
+    assert claim_of(table_rows(TABLE, {**ours, **dict(list(theirs.items())[:3])}), "C4").outcome == HELD
+    assert claim_of(table_rows(TABLE, {**ours, **theirs}), "C4").outcome == NOT_HELD, "the paper's own, where both have all"
 
 
 def test_claims_on_places_need_all_the_papers_agents_at_one_length() -> None:
@@ -451,6 +514,19 @@ def test_file_that_is_here_counts_where_rows_of_two_are_known() -> None:
         assert evidence.left_out == (3 if here == other else 1)
 
 
+def test_run_that_stands_for_two_columns_is_one_run_of_its_file() -> None:
+    walker = "walker2d-medium-sb3"  # after so few steps "DCE one setting" is DCE under another hash
+    rows = results.merge(
+        [
+            table_rows(TABLE, {walker: {"DCE": [40.0, 41.0]}}),
+            table_rows(TABLE, {walker: {"BC": [30.0, 31.0, 32.0]}}, sha="cd" * 32),
+        ]
+    )
+    assert len(evidence_of(rows[rows["agent"] == "dce"]).last(TABLE.variant("DCE one setting"), walker)) == 2
+    evidence = evidence_of(rows)
+    assert evidence.last(TABLE.variant("BC"), walker).tolist() == [30.0, 31.0, 32.0] and evidence.left_out == 2
+
+
 def test_reproduction_counts_rows_of_d4rl_at_the_papers_length_only() -> None:
     table = {"walker2d-medium-v2": {"DCE": [84.0, 85.0] * 2 + [84.5]}, "hopper-medium-v2": {"DCE": [10.0, 11.0] * 2 + [10.5]}}
     own = {"walker2d-random-sb3": {"DCE": [0.0, 0.0]}}
@@ -462,6 +538,9 @@ def test_reproduction_counts_rows_of_d4rl_at_the_papers_length_only() -> None:
     assert make_report(evidence_of(table_rows(TABLE, table))).verdicts[-1].outcome == UNTESTED, "too short"
     few = table_rows(TABLE, {"hopper-medium-v2": {"DCE": [10.0, 11.0]}}, n_updates=1_000_000)
     assert make_report(evidence_of(few)).verdicts[-1].outcome == UNTESTED, "the interval of two seeds overlaps anything"
+    lost = few[few["seed"] == 1].iloc[:1].assign(metric="diverged", step=500, value=1.0)
+    failed = make_report(evidence_of(results.merge([few[few["seed"] == 0], lost]))).verdicts[-1]
+    assert failed.outcome == NOT_HELD and "or DCE diverged on any seed" in failed.rule, "whatever the number of seeds"
 
 
 def test_cause_of_a_loss_is_the_change_that_closes_the_gap() -> None:
@@ -564,6 +643,7 @@ def test_report_from_rows_alone_is_the_same_every_time(tmp_path: Path) -> None:
     }
     page = (tmp_path / "a" / "results.md").read_text()
     assert "![Ablation of beta](figures/fig-beta.png)" in page and f"`{CHEETAH}` abababab…" in page
+    assert '"No data": nor can there be any without files of D4RL' in page, "whether they are on this machine or not"
     assert "## The paper's claims" in page and "**held**" in page and "**could not be tested**" in page
     assert not (tmp_path / "a" / "runs").exists(), "nothing is trained"
 

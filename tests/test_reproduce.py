@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -19,7 +20,7 @@ import pandas as pd
 import pytest
 import torch as th
 from commands import sb3_dce
-from result_rows import keys_of
+from result_rows import keys_of, run_rows
 from rich.console import Console
 from update_tools import all_tensors, largest_difference
 
@@ -32,11 +33,11 @@ from sb3_dce.experiments import results
 from sb3_dce.experiments import run as experiment_run
 from sb3_dce.experiments.grid import PlannedRun, Scale, expand, experiment_ids, load_experiment
 from sb3_dce.experiments.probe import prepare_probe
-from sb3_dce.experiments.reproduce import Request, plan_runs, reproduce, scale_of
+from sb3_dce.experiments.reproduce import Request, command_of, parse_ids, plan_runs, reproduce, scale_of
 from sb3_dce.experiments.run import execute, is_complete, population_file, populations
 from sb3_dce.population_runs import BatchedRuns
 from sb3_dce.run_files import RunSpec, read_divergence, write_divergence, write_result
-from sb3_dce.runs import run
+from sb3_dce.runs import StoppedError, run
 from sb3_dce.training import load_any
 
 TINY = "halfcheetah-tiny-sb3"
@@ -101,6 +102,26 @@ def test_parts_of_a_grid_are_chosen_by_agent_and_seed(tmp_path: Path) -> None:
     planned = plan_runs(experiment, scale_of(experiment, request), request)
     assert [(r.variant, r.spec.seed) for r in planned] == [("IQL", 7), ("DCE", 7), ("IQL", 8), ("DCE", 8)]
     assert {(r.spec.n_updates, r.spec.eval_freq) for r in planned} == {(4, 2)}
+
+
+def test_what_the_chosen_runs_need_is_run_too(tmp_path: Path) -> None:
+    experiment = load_experiment("fig-ood")
+    for agents in (("probe",), ("dce_probe",), ()):
+        request = Request(("fig-ood",), "smoke", tmp_path, agents=agents, seeds=2)
+        planned = plan_runs(experiment, scale_of(experiment, request), request)
+        assert [(r.variant, r.spec.seed) for r in planned] == [("DCE", 0), ("probe", 0), ("DCE", 1), ("probe", 1)]
+
+
+def test_experiment_that_is_named_twice_is_made_once() -> None:
+    assert parse_ids("bounds, table1,bounds") == ("bounds", "table1")
+    assert parse_ids("all,all") == parse_ids("all") == tuple(experiment_ids())
+
+
+def test_evaluations_of_what_is_not_trained_are_not_asked_for(tmp_path: Path) -> None:
+    experiment, request = load_experiment("fig-sac"), Request(("fig-sac",), "smoke", tmp_path, updates=70)
+    with pytest.raises(ConfigError, match="70"):
+        scale_of(experiment, request)
+    assert scale_of(experiment, replace(request, report_only=True)).updates == 70
 
 
 def test_precision_of_a_call_is_that_of_its_runs(tmp_path: Path) -> None:
@@ -169,6 +190,41 @@ def test_runs_of_other_commands_become_rows_without_training(tmp_path: Path) -> 
     before = (tmp_path / "out" / "rows" / "table1.csv.gz").read_bytes()
     assert sb3_dce("reproduce", "table1", *arguments, "--import", str(tmp_path / "compare")).code == 0
     assert (tmp_path / "out" / "rows" / "table1.csv.gz").read_bytes() == before, "nothing is counted twice"
+
+
+def test_page_names_a_command_that_makes_the_same_page(tmp_path: Path) -> None:
+    experiment = load_experiment("run-times")
+    smoke, kept, page = experiment.scales["smoke"], tmp_path / "rows of mine", tmp_path / "page.md"
+    lengths = {20: ("BC", "DCE"), 40: ("BC", "IQL", "DCE")}  # without --updates the longer ones are shown
+    rows = [run_rows(experiment, name, TINY, 0, n_updates=n, scale=smoke) for n, names in lengths.items() for name in names]
+    results.write_rows(kept / "run-times.csv.gz", results.merge(rows))
+    request = Request(("run-times",), "smoke", tmp_path / "its out", updates=20, reuse=(kept,), report_only=True, page=page)
+    reproduce(request, QUIET)
+    made = page.read_text()
+    page.unlink()
+    (command,) = re.findall(r" by `(sb3-dce .*)`; no score", made)
+    assert sb3_dce(*shlex.split(command)[1:]).code == 0
+    assert page.read_text() == made and "Gradient steps: 20;" in made
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"agents": ("BC", "iql"), "seeds": 2, "first_seed": 3}, "--agents BC,iql --seeds 2 --first-seed 3"),
+        ({"agents": ("SAC, alpha 1",)}, "--agents 'SAC, alpha 1;'"),
+        ({"datasets": ("present",), "eval_freq": 10}, "--datasets present --eval-freq 10"),
+        ({"precision": "tf32", "workers": 4}, "--precision tf32"),
+    ],
+)
+def test_command_of_a_page_has_what_decides_on_its_runs(settings: dict[str, Any], words: str) -> None:
+    request = Request(("fig-sac",), "cpu", Path("out"), **settings)
+    assert command_of(request) == f"sb3-dce reproduce fig-sac --scale cpu {words} --out out"
+
+
+def test_page_of_the_documentation_names_its_own_command() -> None:
+    page = Path("docs/results.md")
+    request = Request(parse_ids("all"), "cpu", Path("docs/results"), report_only=True, page=page)
+    assert f" by `{command_of(request)}`;" in (Path(__file__).parents[1] / page).read_text(encoding="utf-8")
 
 
 class Faulty(NamedTuple):
@@ -292,6 +348,20 @@ def test_population_whose_checkpoints_have_gone_is_none_to_go_on_with(
     (tmp_path / "runs" / "population-damaged.pt").write_bytes(b"no state")
     train(plan, device="cuda")
     assert trained == [7, 4, 3] and all(is_complete(r.spec) for r in plan)
+
+
+def test_run_that_was_interrupted_alone_goes_on_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trained: list[int]
+) -> None:
+    def on_the_cpu(specs: list[RunSpec], *_: Any) -> list[dict[str, Any]]:
+        return [run(replace(spec, device="cpu")) for spec in specs]
+
+    monkeypatch.setattr(experiment_run, "launch_all", on_the_cpu)
+    plan = [r for r in small_plan("fig-beta", tmp_path, updates=4) if r.spec.algo == "dce"]
+    with pytest.raises(StoppedError):
+        run(plan[0].spec, stop=lambda: True)
+    train(plan, device="cuda")
+    assert trained == [6] and all(is_complete(r.spec) for r in plan)
 
 
 def test_probe_of_a_run_that_diverged_is_not_begun(tmp_path: Path) -> None:
@@ -564,6 +634,18 @@ def test_cluster_that_is_not_there_is_said_in_one_sentence(tmp_path: Path) -> No
     pytest.importorskip("ray")
     with pytest.raises(ConfigError, match=r"no Ray cluster at 127\.0\.0\.1:1"):
         train(small_plan("fig-cql-return", tmp_path), ray_address="127.0.0.1:1")
+
+
+def test_node_without_this_package_is_not_taken_for_one_that_was_lost() -> None:
+    ray = pytest.importorskip("ray")
+    from sb3_dce.experiments.cluster import not_begun
+
+    cause = "ModuleNotFoundError: No module named 'sb3_dce'"
+    report = f"Traceback (most recent call last):\n  File 'worker.py', line 1\n{cause}\n"
+    error = ray.exceptions.RayTaskError("train_on_node", report, ModuleNotFoundError(), "ray::train_on_node", 7, "127.0.0.1")
+    for raised in (error, error.as_instanceof_cause()):
+        text = str(not_begun("dce seed 0", raised))
+        assert text.startswith(f"dce seed 0 could not be begun on its node: {cause}. Each node needs this package")
 
 
 def test_files_from_a_node_are_written_inside_the_run_only(tmp_path: Path) -> None:

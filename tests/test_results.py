@@ -14,8 +14,9 @@ import pytest
 import yaml
 from result_rows import keys_of, run_rows
 
+from sb3_dce.data import find_file
 from sb3_dce.data.catalog import normalized_score
-from sb3_dce.errors import CheckpointError
+from sb3_dce.errors import CheckpointError, ConfigError
 from sb3_dce.experiments import results
 from sb3_dce.experiments.grid import PlannedRun, load_experiment
 from sb3_dce.experiments.results import ResultsError
@@ -112,12 +113,36 @@ def test_run_that_diverged_is_a_result(finished: Path, tmp_path: Path) -> None:
     assert "seconds" not in set(rows["metric"])
 
 
+def test_run_that_diverged_while_it_was_made_longer_has_diverged(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    config = yaml.safe_load((folder / "config.yml").read_text())
+    config["run"]["n_updates"] = 20
+    (folder / "config.yml").write_text(yaml.safe_dump(config))
+    write_divergence(folder, 15, "critic_loss not finite")
+    rows = results.rows_of_run(folder, "table1")
+    assert rows is not None
+    assert set(rows["n_updates"]) == {20} and rows[rows["metric"] == "diverged"]["step"].tolist() == [15]
+    assert not set(rows["metric"]) & {"seconds", "n_episodes"}
+
+
 def test_run_that_is_being_made_longer_keeps_its_rows(finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     shutil.copytree(finished, folder)
     (folder / "progress_12.csv").write_text("time/total_timesteps,train/q_data\n16,1e9\n")
     before, after = (results.rows_of_run(path, "table1") for path in (finished, folder))
     assert before is not None and after is not None and before.equals(after)
+
+
+def test_run_on_a_file_that_has_moved_keeps_its_rows(tmp_path: Path) -> None:
+    data, folder = tmp_path / "my.data.hdf5", tmp_path / "run"
+    shutil.copy(find_file(TINY)[0], data)
+    run(RunSpec("offline_bc", str(data), 0, 2, str(folder), 2, 1, QUICK))
+    before = results.rows_of_run(folder, "table1")
+    data.rename(tmp_path / "moved.hdf5")
+    after = results.rows_of_run(folder, "table1")
+    assert before is not None and after is not None and before.equals(after)
+    assert set(after["dataset"]) == {"my.data"}
 
 
 def test_log_of_a_run_that_was_killed_counts_each_step_once(tmp_path: Path) -> None:
@@ -137,6 +162,13 @@ def test_written_rows_are_read_without_loss_and_always_in_the_same_bytes(made_up
     pd.testing.assert_frame_equal(
         again.sort_values(order, ignore_index=True), made_up.sort_values(order, ignore_index=True), check_dtype=False
     )
+
+
+def test_rows_on_two_versions_of_a_file_have_one_order(made_up: pd.DataFrame, tmp_path: Path) -> None:
+    versions = [made_up, made_up.assign(dataset_sha256="cd" * 32)]
+    results.write_rows(tmp_path / "a.csv.gz", results.merge(versions))
+    results.write_rows(tmp_path / "b.csv.gz", results.merge(versions[::-1]))
+    assert (tmp_path / "a.csv.gz").read_bytes() == (tmp_path / "b.csv.gz").read_bytes()
 
 
 def test_run_in_two_files_counts_once(made_up: pd.DataFrame, tmp_path: Path) -> None:
@@ -191,7 +223,7 @@ def test_run_with_two_sets_of_hyperparameters_is_refused(made_up: pd.DataFrame) 
 def test_damaged_file_is_refused_by_name(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "table1.csv.gz"
     path.write_bytes(content)
-    with pytest.raises(ResultsError, match=r"table1\.csv\.gz"):
+    with pytest.raises(ResultsError, match=r"table1\.csv\.gz: .*Make the file again from the run folders"):
         results.read_rows(path)
 
 
@@ -208,4 +240,14 @@ def test_folder_of_something_else_is_refused_by_name(finished: Path, tmp_path: P
     shutil.copytree(finished, folder)
     (folder / "config.yml").write_text("run: {algo: dce}\n")
     with pytest.raises(CheckpointError, match="not that of a run"):
+        results.rows_of_run(folder, "table1")
+
+
+def test_run_of_an_agent_that_is_unknown_here_is_refused_by_both_names(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(finished, folder)
+    config = yaml.safe_load((folder / "config.yml").read_text())
+    config["run"]["algo"] = "offline_newer"
+    (folder / "config.yml").write_text(yaml.safe_dump(config))
+    with pytest.raises(ConfigError, match=r"run: .*'offline_newer'"):
         results.rows_of_run(folder, "table1")

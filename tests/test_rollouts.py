@@ -157,6 +157,10 @@ def test_actions_are_in_the_units_of_the_environment() -> None:
 def test_number_of_episodes_is_checked_and_a_missing_simulator_is_no_error() -> None:
     with pytest.raises(ConfigError, match="n_eval_episodes"):
         make_rollouts("halfcheetah-medium-v2", 0)
-    with pytest.raises(ConfigError, match="n_envs"):
-        make_rollouts("halfcheetah-medium-v2", 2, 0)
+    for n_envs in (0, 10_001):
+        with pytest.raises(ConfigError, match="n_envs"):
+            make_rollouts("halfcheetah-medium-v2", 2, n_envs)
+    with pytest.raises(ConfigError, match=r"n_eval_episodes must be an integer in \[1, 10000\], got 10001.*n_envs"):
+        make_rollouts("halfcheetah-medium-v2", 10_001)  # the next evaluation would have some of its seeds
+    assert make_rollouts("halfcheetah-medium-v2", 10_001, 10) is not None
     assert make_rollouts("antmaze-umaze", 2) is None

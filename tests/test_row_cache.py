@@ -225,6 +225,22 @@ def test_other_code_of_the_package_has_other_rows(path: Path, monkeypatch: pytes
     assert not is_mapped(read(path)[0])
 
 
+@pytest.mark.parametrize("own", [False, True], ids=["beside the data", "in the user's cache"])
+def test_rows_of_other_code_are_removed(own: bool, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = "halfcheetah-tiny-sb3" if own else path
+    folder = tmp_path / "xdg" / "sb3_dce" / "rows" if own else path.parent / FOLDER_NAME
+    read(name)
+    read(name, drop_nonfinite=True)
+    before = set(folder.iterdir())
+    monkeypatch.setattr("sb3_dce.data.row_cache._code_hash", lambda: "after a change of a rule")
+    read(name)
+    assert len(before) == 4 and len(set(folder.iterdir())) == 2 and before.isdisjoint(folder.iterdir())
+    monkeypatch.undo()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert_identical(read(name)[0], read(name, cache=False)[0])
+    assert is_mapped(read(name)[0])
+
+
 def test_file_that_changes_meanwhile_is_not_kept(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from sb3_dce.data import row_cache
 

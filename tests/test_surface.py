@@ -107,7 +107,7 @@ def test_a_model_is_not_evaluated_where_it_does_not_belong(transitions: Transiti
 
 def test_a_mistyped_dataset_is_no_reason_to_evaluate_nothing() -> None:
     for call in (lambda: rollouts_of("halfcheetah-mediun", 1), lambda: EvaluationCallback(None, "halfcheetah-mediun", 1)):
-        with pytest.raises(DatasetError, match="Did you mean halfcheetah-medium"):
+        with pytest.raises(DatasetError, match="Did you mean 'halfcheetah-medium"):
             call()
 
 
@@ -356,9 +356,11 @@ def test_version_and_module() -> None:
 def test_tensorboard_is_written_by_runs_that_ask_for_it(tmp_path: Path) -> None:
     pytest.importorskip("tensorboard")
     small = ("--updates", "10", "--eval-freq", "10", "--eval-episodes", "1", "--set", "policy_kwargs={net_arch: [8]}")
-    options = (*small, "--set", f"tensorboard_log={tmp_path / 'tb'}", "--out", str(tmp_path / "run"), "--workers", "1")
-    assert sb3_dce("train", TINY, "--algo", "bc", *options).code == 0
-    assert list((tmp_path / "tb" / f"offline_bc_{TINY}_0").glob("events.*"))
+    options = (*small, "--set", f"tensorboard_log={tmp_path / 'tb'}", "--workers", "1")
+    for out in ("one", "other"):  # each has a folder of its own there
+        assert sb3_dce("train", TINY, "--algo", "bc", *options, "--out", str(tmp_path / out)).code == 0
+    assert len(list((tmp_path / "tb").glob(f"offline_bc_{TINY}_0_*/events.*"))) == 2
+    assert len(list((tmp_path / "tb").iterdir())) == 2
 
 
 # -- what users of Stable-Baselines3 share -----------------------------------------------------------------------------

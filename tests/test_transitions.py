@@ -283,6 +283,16 @@ def test_unmarked_jump_ends_an_episode_of_a_replay_set() -> None:
     assert info.episodes == marked + 1 and info.episode_rule.endswith("unmarked jumps of the observation")
 
 
+def test_unmarked_jump_counts_among_the_ends_without_a_terminal(tmp_path: Path) -> None:
+    arrays = base_arrays()
+    arrays["next_observations"][10] += 1.0
+    data = Transitions.from_arrays(**arrays)
+    assert np.flatnonzero(data.timeouts).tolist() == [10, 39, 119, 159, 199] and data.info.n_timeouts == 5
+    data.to_hdf5(tmp_path / "again.hdf5")
+    again = Transitions.from_hdf5(tmp_path / "again.hdf5")
+    assert np.array_equal(again.timeouts, data.timeouts) and np.array_equal(again.episodes, data.episodes)
+
+
 # -- the object ---------------------------------------------------------------------------------------------------
 
 

@@ -22,7 +22,7 @@ from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_dce import OfflineBC, OfflineDCE, OfflineIQL, OfflineSAC, OfflineTD3BC, Transitions, load_dataset, run_files
 from sb3_dce.envs import SpacesEnv
-from sb3_dce.errors import ConfigError, DatasetIntegrityError, DatasetNotFoundError, DatasetWarning
+from sb3_dce.errors import ConfigError, DatasetError, DatasetIntegrityError, DatasetNotFoundError, DatasetWarning
 from sb3_dce.evaluation import EvaluationCallback
 from sb3_dce.networks import StandardizedExtractor
 from sb3_dce.rollouts import Rollouts
@@ -149,6 +149,31 @@ def test_buffer_with_other_rows_is_noticed(tmp_path: Path) -> None:
         fresh.learn(1)
     fresh.save(tmp_path / "fresh.zip")
     OfflineDCE.load(tmp_path / "fresh.zip").learn(1)
+
+
+def test_refused_data_leave_the_model_as_it_was(tmp_path: Path) -> None:
+    load_dataset(arrays()).to_hdf5(tmp_path / "data.hdf5")
+    model = OfflineDCE.load_dataset(tmp_path / "data.hdf5", seed=0, d4rl_compat=True, **SMALL)
+    for wrong, error in (("halfchetah-medium", DatasetError), (load_dataset(arrays()), ConfigError)):
+        with pytest.raises(error):
+            model.set_dataset(wrong)
+        assert model.dataset == str(tmp_path / "data.hdf5")
+    assert model.learn(1).dataset_statistics["rows"] == 54, "the refused ones have 57"
+
+
+def test_buffer_of_another_model_is_refused(tmp_path: Path) -> None:
+    def model(n_actions: int, scale: float = 1.0) -> OfflineDCE:
+        own = {**arrays(), "actions": np.random.default_rng(0).uniform(-1, 1, (60, n_actions))}
+        return OfflineDCE.load_dataset(load_dataset(own, action_scale=scale), seed=0, **SMALL)
+
+    model(2).save_replay_buffer(tmp_path / "buffer.pkl")
+    for other, message in (
+        (model(3), "actions of width 2, the model wants 3 and 3"),
+        (model(2, 2.0), "the model's are from -2 to 2"),
+    ):
+        with pytest.raises(DatasetError, match=message):
+            other.load_replay_buffer(tmp_path / "buffer.pkl")
+        assert other.learn(1).replay_buffer.size() == 57, "its own data are still there"
 
 
 def test_empty_buffer_changes_nothing(tmp_path: Path) -> None:

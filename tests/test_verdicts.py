@@ -13,7 +13,7 @@ from sb3_dce.experiments import results
 from sb3_dce.experiments.claims import claim_table
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import load_experiment
-from sb3_dce.experiments.judging import CLOSE, HELD, NOT_HELD, UNTESTED, uncertainty
+from sb3_dce.experiments.judging import CLOSE, HELD, NOT_HELD, UNTESTED, uncertainty, values_of
 from sb3_dce.experiments.reports import reproduction
 from sb3_dce.experiments.verdicts import verdicts
 from sb3_dce.theory import shift_factor
@@ -125,6 +125,13 @@ def test_alpha_rises_by_more_than_seeds_can_do(alphas: tuple[float, ...], outcom
     assert one_of(outcomes("fig-alpha", scored("fig-alpha", {CHEETAH: values}, "ent_coef")), "rises with beta") == outcome
     both = {CHEETAH: values, "halfcheetah-medium-replay-sb3": {"beta 1": 0.3, "beta 4": 0.1}}
     assert one_of(outcomes("fig-alpha", scored("fig-alpha", both, "ent_coef")), "rises with beta") == NOT_HELD
+
+
+def test_set_without_all_betas_is_not_tested_but_refutes() -> None:
+    whole = {CHEETAH: {"beta 1": 0.3, "beta 2": 0.5, "beta 4": 0.9}}
+    for values, outcome in (((0.3, 0.9), UNTESTED), ((0.5, 0.5), UNTESTED), ((0.9, 0.3), NOT_HELD)):
+        two = {"halfcheetah-medium-replay-sb3": dict(zip(("beta 1", "beta 4"), values, strict=True))}
+        assert one_of(outcomes("fig-alpha", scored("fig-alpha", {**whole, **two}, "ent_coef")), "rises with beta") == outcome
 
 
 def test_seeds_that_agree_tell_a_smaller_difference() -> None:
@@ -341,6 +348,15 @@ def test_wave_of_a_run_that_diverged_is_not_judged() -> None:
     assert one_of(outcomes("fig-beta", results.merge([runs[0], broken, *runs[2:]])), "large wave") == UNTESTED
 
 
+def test_seed_that_diverges_makes_no_wave() -> None:
+    experiment = load_experiment("fig-beta")
+    curve = [400.0 + i for i in range(20)]
+    runs = [run_rows(experiment, f"beta {b}", CHEETAH, 0, curves={"q_data": curve}, n_updates=200_000) for b in (0, 2, 4, 8)]
+    high = run_rows(experiment, "beta 2", CHEETAH, 1, curves={"q_data": [900.0] * 20}, n_updates=200_000)
+    rows = results.merge([*runs, high[high["step"] <= 150_000]])
+    assert one_of(outcomes("fig-beta", rows), "large wave") == NOT_HELD
+
+
 def test_parts_of_an_experiment_are_of_one_file() -> None:
     experiment = load_experiment("fig-beta")
     new, old = "cd" * 32, "ab" * 32
@@ -395,6 +411,29 @@ def test_few_seeds_are_taken_to_spread_as_much_as_any_agent_on_the_data() -> Non
     assert errors(DCE=[40.0], IQL=[10.0, 20.0, 30.0]) == [10.0, pytest.approx(10.0 / np.sqrt(3))]
 
 
+@pytest.mark.parametrize(("spread", "outcome"), [(0.0, HELD), (30.0, CLOSE)])
+def test_agents_that_a_claim_is_not_about_tell_how_far_seeds_spread(spread: float, outcome: str) -> None:
+    returns = load_experiment("fig-alpha-return")
+    single = {"DCE, alpha 1": 60, "DCE, alpha 3": 40, "Eq. 18, alpha 1": 60, "Eq. 18, alpha 3": 40}
+    runs = [scored("fig-alpha-return", {CHEETAH: single})]
+    runs += [
+        run_rows(returns, "DCE, alpha 5", CHEETAH, seed, curves={"score": [40.0 + spread * seed] * 10}, n_updates=100_000)
+        for seed in range(2)
+    ]
+    assert one_of(outcomes("fig-alpha-return", results.merge(runs)), "At alpha 3 both are below") == outcome
+
+
+def test_only_scores_have_an_uncertainty_over_seeds() -> None:
+    experiment = load_experiment("fig-cql-return")
+    rows = run_rows(experiment, "DCE", CHEETAH, 0, 40.0, {"q_data": [300.0] * 10})
+    evidence = Evidence(experiment, rows, experiment.scales["cpu"])
+    found = {metric: values_of(evidence, ["DCE"], metric) for metric in ("score", "q_data")}
+    assert {metric: values is not None and list(values.errors) for metric, values in found.items()} == {
+        "score": ["DCE"],
+        "q_data": [],
+    }
+
+
 @pytest.mark.parametrize(("alphas", "outcome"), [((0.2, 0.3, 0.5, 0.25), HELD), ((0.2, 0.3, 0.35, 0.25), NOT_HELD)])
 def test_alpha_differs_between_data_sets_by_a_factor(alphas: tuple[float, ...], outcome: str) -> None:
     experiment = load_experiment("fig-alpha")
@@ -413,6 +452,14 @@ def test_flatter_curve_is_the_one_that_varies_less(slope: float, outcome: str) -
     for n_updates, expected in ((200_000, outcome), (100_000, UNTESTED)):  # before, Q is on the way to its level
         rows = [run_rows(experiment, n, CHEETAH, 0, curves={"q_data": q}, n_updates=n_updates) for n, q in curves.items()]
         assert one_of(outcomes("fig-cql-q", results.merge(rows)), "Q is flatter") == expected
+
+
+def test_curve_without_any_spread_is_the_flatter_one() -> None:
+    experiment = load_experiment("fig-cql-q")
+    for slope, outcome in ((1.0, HELD), (0.0, CLOSE)):
+        curves = {"expectile 0.7": [slope * i for i in range(25)], "without policy": [5.0] * 25}
+        rows = [run_rows(experiment, n, CHEETAH, 0, curves={"q_data": q}, n_updates=200_000) for n, q in curves.items()]
+        assert one_of(outcomes("fig-cql-q", results.merge(rows)), "Q is flatter") == outcome
 
 
 def test_claims_on_demonstrations_of_people_are_not_tested_on_those_of_a_policy() -> None:

@@ -128,7 +128,7 @@ def build_rows(
     _require_rows(used, where)
     check_episodes(episodes, int(not used[-1]), timeouts is not None, spec.max_episode_steps if spec else None, findings)
 
-    bad = check_finite(summaries.values(), rows, used, options.drop_nonfinite, where)
+    bad = check_finite(summaries.values(), rows, used, options.drop_nonfinite, findings, where)
     if bad is not None:
         used &= ~bad
         n_bad = int(bad.sum())

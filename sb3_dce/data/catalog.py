@@ -8,7 +8,6 @@ of the D4RL set they stand in for.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from os import PathLike
@@ -17,6 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from sb3_dce.checks import did_you_mean
 from sb3_dce.errors import DatasetError
 
 Family = Literal["gym", "adroit", "kitchen", "antmaze"]
@@ -114,11 +114,10 @@ def resolve(name: str) -> DatasetSpec:
     for candidate in (key, *(f"{key}-{version}" for version in _DEFAULT_VERSIONS)):
         if candidate in _SPECS:
             return _SPECS[candidate]
-    close = difflib.get_close_matches(key, _SPECS, n=4, cutoff=0.5)
-    did_you_mean = f"Did you mean {', '.join(close)}? " if close else ""
+    close = did_you_mean(key, _SPECS, n=4, cutoff=0.5)  # the name of a task alone, such as "hopper", is close enough
     raise DatasetError(
         f"unknown dataset {name!r}",
-        hint=f"{did_you_mean}All names: sb3-dce datasets list --all; a file of your own is given as a path",
+        hint=f"{close}All names: sb3-dce datasets list --all; a file of your own is given as a path",
         key=name,
     )
 

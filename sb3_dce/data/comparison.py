@@ -21,6 +21,7 @@ from sb3_dce.data.layout import CORE_KEYS
 from sb3_dce.data.transitions import Transitions
 from sb3_dce.errors import DatasetFormatError, DatasetNotFoundError, DatasetSemanticsError
 from sb3_dce.files import write_text
+from sb3_dce.student import student_quantile, welch_freedom
 
 IDENTICAL, ALIKE, DIFFERENT = "identical", "statistically equal", "different"
 # Probability that some quantity of two samples of the same thing is called different: that of three standard errors.
@@ -42,7 +43,7 @@ class DatasetCard:
     :param content_hash: SHA-256 of the transitions, independent of format and compression
     :param sha256: hash of the file, as results name it; None for arrays
     :param means: quantity to its mean over the episodes, in the units of the data
-    :param stds: quantity to its standard deviation over the episodes
+    :param stds: quantity to its standard deviation over the episodes, with divisor n
     """
 
     id: str
@@ -118,7 +119,7 @@ class Comparison:
     :param verdict: ``identical``, ``statistically equal`` or ``different``
     :param reasons: why they are different, one line a quantity, the farthest first
     :param n_quantities: quantities compared
-    :param limit: largest difference that chance explains, in standard errors
+    :param limit: largest difference that chance explains, in standard errors; of the quantity for which that is most
     """
 
     verdict: str
@@ -131,16 +132,16 @@ class Comparison:
         if self.n_quantities == 0:
             return self.verdict
         found = f"{len(self.reasons) or 'none'} of {self.n_quantities} quantities"
-        return f"{self.verdict}: {found} further apart than {self.limit:.1f} standard errors over episodes"
+        return f"{self.verdict}: {found} further apart than by chance, which explains up to {self.limit:.1f} standard errors"
 
 
 def compare_datasets(first: DatasetCard, second: DatasetCard) -> Comparison:
     """
     Compare two datasets by their content and, if that differs, by their whole episodes.
 
-    A quantity differs if its means are farther apart than chance explains (the standard error has the episode as its unit:
-    rows of one episode are no independent draws). The limit is Bonferroni's for all quantities together, so two samples of
-    one policy are called different about once in 370 times, whatever the number of entries.
+    A quantity differs if its means are farther apart than chance explains, by Welch's test (the standard error has the episode
+    as its unit: rows of one episode are no independent draws). The limit is Bonferroni's for all quantities together, so two
+    samples of one policy are called different about once in 370 times, whatever the number of entries and of episodes.
 
     :param first: card of one dataset
     :param second: card of the other
@@ -159,22 +160,27 @@ def compare_datasets(first: DatasetCard, second: DatasetCard) -> Comparison:
                 hint=f"A comparison of data that are not identical needs {MIN_EPISODES} episodes on both sides",
                 count=card.episodes,
             )
-    limit = NormalDist().inv_cdf(1 - FAMILY_ERROR / (2 * len(first.means)))
-    far = sorted(((_distance(first, second, name), name) for name in first.means), reverse=True)
+    level = 1 - FAMILY_ERROR / len(first.means)
+    far = sorted(((*_distance(first, second, name, level), name) for name in first.means), reverse=True)
     reasons = tuple(
         f"{name}: {first.means[name]:.6g} and {second.means[name]:.6g}, {distance:.1f} standard errors apart"
-        for distance, name in far
-        if distance > limit
+        for distance, by_chance, name in far
+        if distance > by_chance
     )
-    return Comparison(DIFFERENT if reasons else ALIKE, reasons, len(far), limit)
+    return Comparison(DIFFERENT if reasons else ALIKE, reasons, len(far), max(by_chance for _, by_chance, _ in far))
 
 
-def _distance(first: DatasetCard, second: DatasetCard, name: str) -> float:
-    """Difference of two means, in standard errors; what never varies may differ by rounding only."""
+def _distance(first: DatasetCard, second: DatasetCard, name: str, level: float) -> tuple[float, float]:
+    """
+    Difference of two means, and that within which chance keeps it with probability ``level``, in standard errors; what never
+    varies may differ by rounding only.
+    """
     gap = abs(first.means[name] - second.means[name])
-    error = float(np.hypot(first.stds[name] / first.episodes**0.5, second.stds[name] / second.episodes**0.5))
+    freedoms = [card.episodes - 1 for card in (first, second)]
+    errors = [card.stds[name] / freedom**0.5 for card, freedom in zip((first, second), freedoms, strict=True)]
     rounding = 1e-6 * max(abs(first.means[name]), abs(second.means[name]))
-    return 0.0 if gap <= rounding else gap / max(error, rounding)
+    limit = student_quantile(welch_freedom(errors, freedoms) if any(errors) else sum(freedoms), level)
+    return (0.0 if gap <= rounding else gap / max(float(np.hypot(*errors)), rounding)), limit
 
 
 def _per_episode(transitions: Transitions) -> Iterator[tuple[str, np.ndarray]]:

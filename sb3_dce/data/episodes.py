@@ -75,23 +75,20 @@ def find_episodes(
     :return: the episodes
     """
     if timeouts is not None:
-        limits, rule = timeouts & ~terminals, "terminals and timeouts"
-        ends = terminals | timeouts
+        ends, rule = terminals | timeouts, "terminals and timeouts"
         if jumps is not None and (jumps & ~ends).any():
             ends, rule = ends | jumps, f"{rule}, and unmarked jumps of the observation"
+    elif horizon is not None:
+        ends = terminals | rows_at_limit(terminals, horizon)
+        rule = f"terminals and every {horizon} rows (no timeouts key)"
+    elif jumps is not None and jumps.any():
+        ends, rule = terminals | jumps, "terminals and jumps of the observation (no timeouts key)"
     else:
-        if horizon is not None:
-            ends = terminals | rows_at_limit(terminals, horizon)
-            rule = f"terminals and every {horizon} rows (no timeouts key)"
-        elif jumps is not None and jumps.any():
-            ends, rule = terminals | jumps, "terminals and jumps of the observation (no timeouts key)"
-        else:
-            ends, rule = terminals, "terminals only (no timeouts key)"
-        limits = ends & ~terminals
+        ends, rule = terminals, "terminals only (no timeouts key)"
     starts = np.concatenate(([0], np.flatnonzero(ends[:-1]) + 1))
     index = np.zeros(len(ends), dtype=np.int32)
     np.cumsum(ends[:-1], out=index[1:])
-    return Episodes(ends, limits, index, starts, np.diff(starts, append=len(ends)), rule)
+    return Episodes(ends, ends & ~terminals, index, starts, np.diff(starts, append=len(ends)), rule)
 
 
 def ends_of_ids(ids: np.ndarray, where: str) -> np.ndarray:

@@ -31,6 +31,7 @@ VERDICTS: tuple[Verdict, ...] = ("ok", "note", "warning", "error")
 EXIT_CODES: dict[Verdict, int] = {"ok": 0, "note": 0, "warning": 1, "error": 2}
 
 READABLE = "readable"  # name of the check that the data could be read at all
+UNUSED_ROWS = "rows that are not used"  # where something is that no transition shows
 
 # An entry counts as lying on its bound if it is nearer than this share of half the range: float32 of tanh, and clipping.
 BOUND_TOLERANCE = 1e-3
@@ -137,10 +138,11 @@ class Examination:
 
 def file_hash(info: DatasetInfo) -> str | None:
     """
-    SHA-256 of the file a dataset was read from, for reports; no error where there is no such file.
+    SHA-256 of the data, for reports; no error where their file has gone.
 
     :param info: facts about a dataset
-    :return: 64 hexadecimal digits, ``None`` for arrays and for datasets that are a folder of files
+    :return: 64 hexadecimal digits, ``None`` for arrays and where the file is not there any more
+    :raises DatasetIntegrityError: if the data have changed since they were read
     """
     return info.sha256 if info.path is not None and info.path.is_file() else None
 
@@ -311,8 +313,11 @@ def _read(name_or_path: str | PathLike[str], options: dict[str, Any], errors: li
 
 
 def _huge_columns(transitions: Transitions) -> tuple[int, str]:
-    low, high = transitions.observations.min(axis=0), transitions.observations.max(axis=0)
-    columns = np.flatnonzero(np.maximum(-low, high) > HUGE_VALUE)
+    arrays = transitions.observations, transitions.next_observations
+    largest = np.max([np.maximum(-array.min(axis=0), array.max(axis=0)) for array in arrays], axis=0)
+    columns = np.flatnonzero(largest > HUGE_VALUE)
+    if not len(columns):
+        return 0, UNUSED_ROWS
     return len(columns), f"observation columns {_listed(columns)}"
 
 
@@ -322,7 +327,7 @@ def _duplicates(transitions: Transitions) -> tuple[int, str]:
     hashes = pd.util.hash_pandas_object(pd.DataFrame(transitions.rows, copy=False), index=False)
     again = hashes.duplicated().to_numpy()
     if not again.any():  # the rows that were equal are among the dropped ones
-        return 0, "rows that are not used"
+        return 0, UNUSED_ROWS
     copy = int(again.argmax())
     first = int((hashes == hashes[copy]).to_numpy().argmax())
     return int(again.sum()), f"transition {copy:,} repeats transition {first:,}, the first of them"

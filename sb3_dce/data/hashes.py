@@ -7,10 +7,14 @@ import os
 from collections.abc import Mapping
 from functools import lru_cache
 from os import PathLike
+from pathlib import Path
 
 import numpy as np
 
 from sb3_dce.data.layout import CORE_KEYS, ArraySource, row_blocks
+
+# Stands for all files of its folder where Minari keeps a file per episode.
+METADATA_FILE = "metadata.json"
 
 
 def content_hash(arrays: Mapping[str, ArraySource]) -> str:
@@ -57,20 +61,53 @@ def file_sha256(path: str | PathLike[str]) -> str:
     return digest.hexdigest()
 
 
+def data_sha256(path: str | PathLike[str]) -> str:
+    """
+    Hash of all that a dataset is read from, by which results name it.
+
+    :param path: file of the dataset; ``metadata.json`` stands for all files of its folder, whose names count, too
+    :return: SHA-256, 64 hexadecimal digits
+    """
+    path = Path(path)
+    if path.name != METADATA_FILE:
+        return file_sha256(path)
+    lines = (f"{file_sha256(file)}  {file.relative_to(path.parent).as_posix()}\n" for file in _files_of(path))
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def data_state(path: str | PathLike[str]) -> tuple[tuple[int, int], ...]:
+    """
+    What tells, without reading a dataset, that it was written again since: sizes and times of the last change.
+
+    :param path: file of the dataset, as for :func:`data_sha256`
+    :return: bytes, and nanoseconds, of each of its files
+    """
+    return tuple((status.st_size, status.st_mtime_ns) for status in map(os.stat, _files_of(Path(path))))
+
+
 def sha256_once(path: str | PathLike[str]) -> str:
     """
-    SHA-256 of a file for callers that ask for it again and again, since :func:`file_sha256` takes a second for a large one.
+    :func:`data_sha256` for callers that ask for it again and again, since it takes a second for a large file.
 
-    :param path: file
-    :return: 64 hexadecimal digits, from memory as long as size, time of change and inode are what they were
+    :param path: file of the dataset
+    :return: 64 hexadecimal digits, from memory as long as sizes, times of change and inodes are what they were
     """
-    state = os.stat(path)
-    return _remembered(os.path.abspath(path), state.st_size, state.st_mtime_ns, state.st_ino)
+    inodes = tuple(os.stat(file).st_ino for file in _files_of(Path(path)))
+    return _remembered(os.path.abspath(path), data_state(path), inodes)
 
 
 @lru_cache(maxsize=64)
-def _remembered(path: str, *_: int) -> str:
-    return file_sha256(path)
+def _remembered(path: str, *_: object) -> str:
+    return data_sha256(path)
+
+
+def _files_of(path: Path) -> list[Path]:
+    """The files of a dataset in the order of their names; hidden ones belong to others, and Minari skips those with ``_``."""
+    if path.name != METADATA_FILE:
+        return [path]
+    inside = ((file, file.relative_to(path.parent)) for file in path.parent.rglob("*"))
+    files = (file for file, name in inside if file.is_file() and not any(part[0] in "._" for part in name.parts))
+    return sorted(files, key=Path.as_posix)  # the same order on every system
 
 
 @lru_cache(maxsize=8)

@@ -166,11 +166,10 @@ def check_layout(
     """
     _check_keys(sources, where, list(found_keys))
     _check_types(sources, where)
-    obs_dim = spec.obs_dim if obs_dim is None and spec else obs_dim
-    act_dim = spec.act_dim if act_dim is None and spec else act_dim
-    expected = {"observations": obs_dim, "actions": act_dim, "next_observations": obs_dim}
-    _check_shapes(sources, where, expected)
-    _check_widths(sources, where, expected, spec)
+    obs, act = _wanted_width("obs_dim", obs_dim, spec), _wanted_width("act_dim", act_dim, spec)
+    wanted = {"observations": obs, "actions": act, "next_observations": obs}
+    _check_shapes(sources, where, {key: width for key, (width, _) in wanted.items()})
+    _check_widths(sources, where, wanted, spec)
     _check_rows(sources, where)
     return RowLayout(_width(sources["observations"]), _width(sources["actions"]))
 
@@ -267,20 +266,30 @@ def _check_shapes(sources: Mapping[str, ArraySource], where: str, expected: Mapp
         )
 
 
+def _wanted_width(option: str, given: int | None, spec: DatasetSpec | None) -> tuple[int | None, str]:
+    """A width, ``None`` for any, and who wants it."""
+    if given is not None:
+        return given, f" by {option}="
+    return (None, "") if spec is None else (getattr(spec, option), f" by {spec.env_id or spec.id}")
+
+
 def _check_widths(
-    sources: Mapping[str, ArraySource], where: str, expected: Mapping[str, int | None], spec: DatasetSpec | None
+    sources: Mapping[str, ArraySource],
+    where: str,
+    wanted: Mapping[str, tuple[int | None, str]],
+    spec: DatasetSpec | None,
 ) -> None:
     widths = {key: _width(sources[key]) for key in MATRIX_KEYS if key in sources}
-    bad = {key: width for key, width in widths.items() if width == 0 or width != (expected[key] or width)}
+    bad = {key: width for key, width in widths.items() if width == 0 or width != (wanted[key][0] or width)}
     if bad:
-        owner = f" by {spec.env_id or spec.id}" if spec else ""
+        owners = {key: wanted[key][1] for key in bad}
         hint = "Use the file of that environment, or pass obs_dim= and act_dim="
-        if spec and spec.family == "kitchen" and widths["observations"] == 59:
+        if all(owner.endswith("=") for owner in owners.values()):
+            hint = "Correct the width that you have passed, or leave it out"
+        elif spec and spec.family == "kitchen" and bad.get("observations") == 59:
             hint = "59 entries are FrankaKitchen-v1's own: D4RL's 60 are [obs[0:9], obs[18:39], goal (30)]"
         raise DatasetFormatError(
-            "; ".join(
-                f"{key} has width {width}, {expected[key] or 'at least 1'} is wanted{owner}" for key, width in bad.items()
-            ),
+            "; ".join(f"{key} has width {bad[key]}, {wanted[key][0] or 'at least 1'} is wanted{owners[key]}" for key in bad),
             where=where,
             hint=hint,
             key=next(iter(bad)),

@@ -13,7 +13,8 @@ from sb3_dce.data.episode_list import arrays_from_episodes
 from sb3_dce.data.hash_record import as_sha256, verify_hash, verify_record
 from sb3_dce.data.layout import CORE_KEYS, EPISODES, REQUIRED_KEYS
 from sb3_dce.data.locate import find_file
-from sb3_dce.data.minari import folder_of, is_minari_name
+from sb3_dce.data.minari import is_minari
+from sb3_dce.data.records import bounds_left_open
 from sb3_dce.data.transitions import Transitions
 from sb3_dce.errors import ConfigError
 
@@ -77,7 +78,7 @@ def load_transitions(name_or_path: str | PathLike[str], *, sha256: str | None = 
     :raises DatasetError: if something is wrong with the dataset
     """
     pin = as_sha256(sha256)
-    if is_minari_name(name_or_path) or folder_of(name_or_path) is not None:
+    if is_minari(name_or_path):
         if pin is not None:
             raise ConfigError(
                 "a dataset of Minari is a folder", where=str(name_or_path), key="sha256", hint="Leave sha256 out."
@@ -130,9 +131,8 @@ def load_dataset(source: DatasetLike, **options: Any) -> Transitions:
         episodes = other if isinstance(other, list | tuple) else other.iterate_episodes()
         arrays: dict[str, Any] = arrays_from_episodes(episodes)
         space: Any = getattr(other, "action_space", None)  # of a dataset of Minari
-        given = options.keys() & {"action_low", "action_high", "action_scale"}
-        if not given and hasattr(space, "low") and np.isfinite((space.low, space.high)).all():
-            options |= {"action_low": np.ravel(space.low), "action_high": np.ravel(space.high)}
+        if hasattr(space, "low") and np.isfinite((space.low, space.high)).all():
+            options |= bounds_left_open(options, {"action_low": np.ravel(space.low), "action_high": np.ravel(space.high)})
         return Transitions.from_arrays(**arrays, **options)
     if type(other).__module__.partition(".")[0] == "pandas":
         return Transitions.from_dataframe(other, **options)

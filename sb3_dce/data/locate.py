@@ -15,7 +15,7 @@ from os import PathLike
 from pathlib import Path
 
 from sb3_dce.data.catalog import DatasetSpec, all_specs, resolve, spec_of_file
-from sb3_dce.data.minari import find_minari, is_minari_name
+from sb3_dce.data.minari import PREFIX, find_minari, folder_of, is_minari, is_minari_name
 from sb3_dce.errors import ConfigError, DatasetError, DatasetFormatError, DatasetNotFoundError
 from sb3_dce.files import exists, expanded
 
@@ -29,12 +29,12 @@ def find_file(name_or_path: str | PathLike[str]) -> tuple[Path, DatasetSpec | No
 
     A path (see :func:`is_path`) wins over a name. A D4RL id is never answered with a ``-sb3`` file, nor with one of Minari.
 
-    :param name_or_path: file, id or alias of the catalogue, or ``minari:`` and an id of Minari
-    :return: existing path, and the entry of the catalogue if the name or the file name is known there
+    :param name_or_path: file, id or alias of the catalogue, ``minari:`` and an id of Minari, or the folder of such a dataset
+    :return: existing file, and the entry of the catalogue if the name or the file name is known there
     :raises DatasetNotFoundError: if there is no such file; the message says where to put it and what is available
     :raises DatasetError: if it is neither a path nor a known name
     """
-    if is_minari_name(name_or_path):
+    if is_minari(name_or_path):
         return find_minari(name_or_path).file, None
     if is_path(name_or_path):
         path = expanded(name_or_path)
@@ -52,10 +52,10 @@ def known_dataset(name_or_path: str | PathLike[str]) -> DatasetSpec | None:
     """
     The entry of the catalogue that :func:`find_file` would give, whether the file is here or not.
 
-    :param name_or_path: file, id or alias of the catalogue, or ``minari:`` and an id of Minari
+    :param name_or_path: as for :func:`find_file`
     :return: entry of the catalogue, ``None`` if the name or the file name is not known there
     """
-    if is_minari_name(name_or_path):
+    if is_minari(name_or_path):
         return None
     if is_path(name_or_path):
         return spec_of_file(name_or_path)
@@ -78,17 +78,18 @@ def catalogue_id(dataset: str | None) -> str | None:
 
 def is_path(name_or_path: str | PathLike[str]) -> bool:
     """
-    Whether a dataset is given by its file rather than by its name.
+    Whether a dataset is given by its file or folder rather than by its name.
 
-    :param name_or_path: file, or id or alias of the catalogue
-    :return: True for a ``Path``, a text with a separator or with the suffix of a dataset (``SUFFIXES``), and any existing file
+    :param name_or_path: as for :func:`find_file`
+    :return: True for a ``Path``, a text with a separator or with the suffix of a dataset (``SUFFIXES``), any existing file,
+        and the folder of a dataset of Minari
     """
     if is_minari_name(name_or_path):
         return False
     if not isinstance(name_or_path, str) or name_or_path.endswith(SUFFIXES):
         return True
     has_separator = any(separator and separator in name_or_path for separator in (os.sep, os.altsep))
-    return has_separator or os.path.isfile(expanded(name_or_path))
+    return has_separator or os.path.isfile(expanded(name_or_path)) or folder_of(name_or_path) is not None
 
 
 def search(spec: DatasetSpec) -> Path | None:
@@ -207,11 +208,12 @@ def short_name(dataset: str | PathLike[str]) -> str:
     """
     Name of a dataset for folders and headings, without the folder it lies in.
 
-    :param dataset: id, ``minari:`` name or file
+    :param dataset: as for :func:`find_file`, but need not be here: a run is known by it after its data have moved
     :return: the id, of Minari with ``-`` in place of ``/``, or the file's name without suffix
-    :raises DatasetNotFoundError: if there is no file for it
+    :raises DatasetError: if it is a folder of Minari whose metadata cannot be read
     """
-    if is_minari_name(dataset):
-        return dataset.removeprefix("minari:").replace("/", "-")
-    path, spec = find_file(dataset)
-    return path.stem if spec is None else spec.id
+    if is_minari(dataset):  # all of Minari's files have the same name
+        name = dataset if is_minari_name(dataset) else find_minari(dataset).name
+        return name.removeprefix(PREFIX).replace("/", "-")
+    spec = known_dataset(dataset)
+    return Path(dataset).stem if spec is None else spec.id

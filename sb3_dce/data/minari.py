@@ -19,13 +19,13 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from sb3_dce.data.file_checks import translated_errors
+from sb3_dce.data.hashes import METADATA_FILE
 from sb3_dce.data.records import Finding
 from sb3_dce.errors import ConfigError, DatasetError, DatasetFormatError, DatasetIntegrityError, DatasetNotFoundError
 from sb3_dce.files import expanded
 
 PREFIX = "minari:"
 ROOT_VARIABLE = "MINARI_DATASETS_PATH"
-METADATA_FILE = "metadata.json"
 HDF5_FILE = "main_data.hdf5"
 ARROW_FORMATS = ("arrow", "parquet")
 # Bounds of spaces make most of it: 12,288 pixels with two bounds each take 150 kB.
@@ -80,6 +80,16 @@ def is_minari_name(name: Any) -> TypeGuard[str]:
     :return: True for a text with ``minari:`` before it, such as ``minari:D4RL/door/human-v2``
     """
     return isinstance(name, str) and name.startswith(PREFIX)
+
+
+def is_minari(name_or_path: str | PathLike[str]) -> bool:
+    """
+    Whether :func:`find_minari` is who finds a dataset.
+
+    :param name_or_path: whatever names a dataset
+    :return: True for a text with ``minari:`` before it, and for a path as for :func:`folder_of`
+    """
+    return is_minari_name(name_or_path) or folder_of(name_or_path) is not None
 
 
 def minari_id(name: str) -> str:
@@ -262,7 +272,7 @@ _DAMAGED = "Download or record the dataset again"
 def _own_name(metadata: dict[str, Any], folder: Path) -> str:
     """Name of a dataset that was given by its path. The id in the metadata is shown only if it looks like one."""
     own = metadata.get("dataset_id")
-    return PREFIX + (own if isinstance(own, str) and _ID.fullmatch(own) else folder.parent.name)
+    return PREFIX + (own if isinstance(own, str) and _ID.fullmatch(own) else folder.absolute().parent.name)
 
 
 def _incomplete(missing: Path, again: str) -> DatasetNotFoundError:

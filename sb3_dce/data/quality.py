@@ -74,7 +74,7 @@ class ActionRange(NamedTuple):
 
 
 def check_finite(
-    summaries: Iterable[ColumnSummary], rows: np.ndarray, usable: np.ndarray, drop: bool, where: str
+    summaries: Iterable[ColumnSummary], rows: np.ndarray, usable: np.ndarray, drop: bool, findings: Findings, where: str
 ) -> np.ndarray | None:
     """
     Look for NaN and infinity.
@@ -83,8 +83,9 @@ def check_finite(
     :param rows: row matrix of :class:`~sb3_dce.data.layout.RowLayout`, shape (n, width), next observations filled in
     :param usable: rows that would be used, shape (rows,)
     :param drop: whether such rows may be dropped
+    :param findings: notes and warnings
     :param where: file, for messages
-    :return: usable rows with such a value, shape (rows,), None if the arrays are clean
+    :return: usable rows with such a value, shape (rows,), None if there are none
     :raises DatasetSemanticsError: if there are some and they may not be dropped
     """
     dirty = [summary for summary in summaries if summary.n_bad]
@@ -94,6 +95,10 @@ def check_finite(
     for block in row_blocks(len(rows)):
         bad[block] = ~np.isfinite(rows[block]).all(axis=1)
     bad &= usable
+    n_values = sum(summary.n_bad for summary in dirty)
+    if not bad.any():
+        findings.note("finite values", f"{n_values} NaN or infinite values are in rows that are not used", n_values)
+        return None
     if not drop:
         counts = (f"{s.key} has {s.n_bad} NaN or infinite values, the first at (row, column) {s.first_bad}" for s in dirty)
         raise DatasetSemanticsError(
@@ -103,7 +108,7 @@ def check_finite(
             hint=f"Repair the file, or drop_nonfinite=True removes {int(bad.sum())} rows",
             key=dirty[0].key,
             index=dirty[0].first_bad,
-            count=sum(summary.n_bad for summary in dirty),
+            count=n_values,
         )
     return bad
 

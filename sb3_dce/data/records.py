@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -14,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sb3_dce.checks import check_optional, did_you_mean
-from sb3_dce.data.hashes import file_sha256
+from sb3_dce.data.hashes import data_sha256, data_state
 from sb3_dce.data.hdf5 import DEFAULT_MAX_BYTES
 from sb3_dce.errors import ConfigError, DatasetFormatError, DatasetIntegrityError
 
@@ -108,11 +107,12 @@ class ReadOptions:
         :return: options with bounds
         :raises DatasetFormatError: if the attribute is something else
         """
-        if attribute is None or self.names_bounds:
+        names = bounds_left_open(vars(self), {"action_low": "low", "action_high": "high"})
+        if attribute is None or not names:
             return self
         try:
-            bounds = json.loads(attribute)
-            low, high = (np.asarray(bounds[name], dtype=np.float32) for name in ("low", "high"))
+            found = json.loads(attribute)
+            bounds: dict[str, Any] = {key: np.asarray(found[name], dtype=np.float32) for key, name in names.items()}
         except (TypeError, ValueError, KeyError) as error:
             raise DatasetFormatError(
                 f"the attribute {BOUNDS_ATTRIBUTE} is no JSON with the lists 'low' and 'high'",
@@ -120,7 +120,7 @@ class ReadOptions:
                 hint="Give the bounds as action_low= and action_high=",
                 key=BOUNDS_ATTRIBUTE,
             ) from error
-        return replace(self, action_low=low, action_high=high)
+        return replace(self, **bounds)
 
     @property
     def names_bounds(self) -> bool:
@@ -159,6 +159,19 @@ class ReadOptions:
                 hint="Give the bounds of the action space",
             )
         return low, high
+
+
+def bounds_left_open(options: Mapping[str, Any], bounds: Mapping[str, Any]) -> dict[str, Any]:
+    """
+    The bounds that data bring themselves, as far as the user gives no others.
+
+    :param options: options of a reader as the user gives them; ``None`` is the same as left out
+    :param bounds: ``action_low`` and ``action_high`` of a space or a file; empty if it has none
+    :return: those of ``bounds`` that are to be added to the options
+    """
+    if options.get("action_scale") is not None:
+        return {}
+    return {key: bound for key, bound in bounds.items() if options.get(key) is None}
 
 
 # Checks of a reader by name; ``other`` is what has no line of its own in ``sb3-dce datasets check``.
@@ -218,7 +231,7 @@ class DatasetInfo:
     :param episode_lengths: rows of each of these episodes
     :param episode_numbers: number of each of these episodes, as in ``Transitions.episodes``
     :param n_terminals: rows at which a task truly ended
-    :param n_timeouts: rows at which a time limit ended an episode
+    :param n_timeouts: rows at which an episode ended without a terminal: at a time limit, or at an unmarked jump
     :param open_last_episode: whether the file ends in the middle of an episode
     :param dropped_rows: ``file_rows - rows``
     :param episode_rule: how the ends of episodes were found
@@ -257,27 +270,28 @@ class DatasetInfo:
     action_space_low: np.ndarray
     action_space_high: np.ndarray
     findings: tuple[Finding, ...] = ()
-    _file_state: tuple[int, int] | None = field(default=None, init=False, repr=False)
+    _data_state: tuple[tuple[int, int], ...] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.path is not None:
-            object.__setattr__(self, "_file_state", file_state(self.path))
+            object.__setattr__(self, "_data_state", data_state(self.path))
 
     @cached_property
     def sha256(self) -> str | None:
         """
-        Hash of the file, computed when it is first asked for (hashing 100 MB takes a noticeable time).
+        Hash of the data, see :func:`~sb3_dce.data.hashes.data_sha256`, computed when it is first asked for (hashing 100 MB
+        takes a noticeable time).
 
         :return: 64 hexadecimal digits, None for arrays
         :raises DatasetIntegrityError: if the file has changed since it was read
         """
         if self.path is None:
             return None
-        if not self.path.is_file() or file_state(self.path) != self._file_state:
+        if not self.path.is_file() or data_state(self.path) != self._data_state:
             raise DatasetIntegrityError(
                 "the file has changed since it was read", where=str(self.path), hint="Read it again", path=self.path
             )
-        return file_sha256(self.path)
+        return data_sha256(self.path)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -298,17 +312,6 @@ class DatasetInfo:
         """
         returns = self.episode_returns
         return float(returns.max() - returns.min()) if len(returns) else 0.0
-
-
-def file_state(path: Path) -> tuple[int, int]:
-    """
-    What tells, without reading a file, that it was written again since: its size and the time of its last change.
-
-    :param path: existing file
-    :return: bytes, and nanoseconds
-    """
-    status = os.stat(path)
-    return status.st_size, status.st_mtime_ns
 
 
 def bounds_attribute(low: np.ndarray, high: np.ndarray) -> dict[str, str]:

@@ -17,6 +17,7 @@ import os
 import warnings
 import zlib
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, fields
 from functools import lru_cache
 from pathlib import Path
@@ -26,10 +27,10 @@ import numpy as np
 
 from sb3_dce.data.build import BuiltRows
 from sb3_dce.data.catalog import DatasetSpec
-from sb3_dce.data.hashes import file_sha256
+from sb3_dce.data.hashes import data_state, file_sha256
 from sb3_dce.data.layout import RowLayout
 from sb3_dce.data.locate import cache_folder, embedded_folder
-from sb3_dce.data.records import DatasetInfo, Finding, ReadOptions, file_state
+from sb3_dce.data.records import DatasetInfo, Finding, ReadOptions
 from sb3_dce.errors import CheckpointError, ConfigError, DatasetWarning
 from sb3_dce.files import write_atomically
 
@@ -55,18 +56,18 @@ def cached_rows(
     if not is_wanted(options):
         return build()
     try:
-        before = file_state(path)
+        before = data_state(path)
         key = _key_of(path, spec, options, reader)
     except (OSError, TypeError, ValueError):  # no such file, or impossible options: the reader has the better message
         return build()
     name = f"{path.name}.{hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]}"
     for folder in _folders(path):
         built = _load(folder / name, key, path)
-        if built is not None and file_state(path) == before:
+        if built is not None and data_state(path) == before:
             return built
     built = build()
-    if file_state(path) == before:
-        _store(built, _folder_to_write(path) / name, key)
+    if data_state(path) == before:
+        _store(built, path, name, key)
     return built
 
 
@@ -114,22 +115,29 @@ def _code_hash() -> str:
 
 
 def _folders(path: Path) -> list[Path]:
-    """Where an entry may be: beside the data, and below the user's cache folder."""
-    return [path.absolute().parent / FOLDER_NAME, cache_folder().with_name("rows")]
+    """Where an entry may be: beside the data and, of a user with a home folder, below the user's cache folder."""
+    folders = [path.absolute().parent / FOLDER_NAME]
+    with suppress(ConfigError):
+        folders.append(cache_folder().with_name("rows"))
+    return folders
 
 
 def _folder_to_write(path: Path) -> Path:
-    beside, own = _folders(path)
-    installed = path.absolute().parent == embedded_folder().absolute()
-    return own if installed or not os.access(beside.parent, os.W_OK) else beside
+    """
+    Where an entry is kept: beside the data, if that folder may be written and is not the package's own.
+
+    :raises ConfigError: if it is none of both, for a user without a home folder
+    """
+    folder = path.absolute().parent
+    is_installed = folder == embedded_folder().absolute()
+    return cache_folder().with_name("rows") if is_installed or not os.access(folder, os.W_OK) else folder / FOLDER_NAME
 
 
 # -- one entry -----------------------------------------------------------------------------------------------------
 
 
-def _store(built: BuiltRows, entry: Path, key: Mapping[str, Any]) -> None:
-    """Write an entry, its facts last, and remove those of earlier contents of the file."""
-    matrix, facts = _files(entry)
+def _store(built: BuiltRows, path: Path, entry_name: str, key: Mapping[str, Any]) -> None:
+    """Write an entry, its facts last, and remove those that it replaces."""
     arrays, scalars = {}, {}
     for name in _info_names():
         value = getattr(built.info, name)
@@ -149,15 +157,16 @@ def _store(built: BuiltRows, entry: Path, key: Mapping[str, Any]) -> None:
     )
     arrays |= {"timeouts": built.timeouts, "episodes": built.episodes, "json": np.frombuffer(text.encode(), dtype=np.uint8)}
     try:
+        entry = _folder_to_write(path) / entry_name
+        matrix, facts = _files(entry)
         with write_atomically(matrix) as stream:
             np.save(stream, built.rows, allow_pickle=False)
         with write_atomically(facts) as stream:
             np.savez(stream, **arrays)  # type: ignore[arg-type]
-    except CheckpointError as exc:
+    except (CheckpointError, ConfigError) as exc:
         warnings.warn(f"rows not kept: {exc}", DatasetWarning)
         return
-    if entry.parent.name == FOLDER_NAME:  # elsewhere the name does not say which file it was
-        _remove_outdated(entry, key["file"])
+    _remove_outdated(entry, key)
 
 
 def _load(entry: Path, key: Mapping[str, Any], path: Path) -> BuiltRows | None:
@@ -201,11 +210,17 @@ def _info_names() -> list[str]:
     return [field.name for field in fields(DatasetInfo) if field.init and field.name not in ("id", "path")]
 
 
-def _remove_outdated(entry: Path, sha256: str) -> None:
+def _remove_outdated(entry: Path, key: Mapping[str, Any]) -> None:
+    """
+    Remove the entries of other code, which nothing reads again, and those of earlier contents of the file. The latter beside
+    the data only: elsewhere the name does not say which file it was.
+    """
+    outdated = ["code", "file"] if entry.parent.name == FOLDER_NAME else ["code"]
     name = entry.name.rpartition(".")[0]
     for facts in entry.parent.glob(f"{glob.escape(name)}.{'[0-9a-f]' * 16}.npz"):
         try:
-            if json.loads(_read_facts(facts)["json"].tobytes())["key"]["file"] != sha256:
+            known = json.loads(_read_facts(facts)["json"].tobytes())["key"]
+            if any(known[part] != key[part] for part in outdated):
                 for file in (facts, facts.with_suffix(".npy")):
                     file.unlink(missing_ok=True)
         except Exception:  # unreadable: it will be replaced when its data are read

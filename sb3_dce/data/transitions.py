@@ -14,13 +14,13 @@ import numpy as np
 from sb3_dce.data.build import BuiltRows, build_rows
 from sb3_dce.data.catalog import DatasetSpec, is_id, normalized_score
 from sb3_dce.data.hash_record import verify_hash
-from sb3_dce.data.hashes import content_hash, file_sha256
+from sb3_dce.data.hashes import METADATA_FILE, content_hash, file_sha256
 from sb3_dce.data.hdf5 import D4RLFile, write_hdf5
 from sb3_dce.data.layout import CORE_KEYS, EPISODES, INCOMPLETE, ArraySource, RowLayout, as_array, wanted_keys
-from sb3_dce.data.minari import METADATA_FILE, Flatten, action_bounds, find_minari, reward_findings
+from sb3_dce.data.minari import Flatten, action_bounds, find_minari, reward_findings
 from sb3_dce.data.minari_episodes import open_episodes
 from sb3_dce.data.npz import arrays_from_npz, flag_from_npz, npz_keys, text_from_npz, write_npz
-from sb3_dce.data.records import BOUNDS_ATTRIBUTE, DatasetInfo, ReadOptions, bounds_attribute
+from sb3_dce.data.records import BOUNDS_ATTRIBUTE, DatasetInfo, ReadOptions, bounds_attribute, bounds_left_open
 from sb3_dce.data.row_cache import cached_rows
 from sb3_dce.data.sb3_buffer import arrays_from_replay_buffer, load_saved_buffer
 from sb3_dce.data.tables import Columns, arrays_from_csv, arrays_from_dataframe, arrays_from_parquet, numbered
@@ -239,7 +239,7 @@ class Transitions:
         :param buffer: ``model.replay_buffer``; several environments, a full ring and ``optimize_memory_usage`` are all right.
             Or the file that ``model.save_replay_buffer`` has written, with ``trust="pickle"``.
         :param trust: ``"safe"`` opens no saved buffer, since such a file is a pickle and may run any code; ``"pickle"`` does
-        :param options: options of :meth:`from_arrays`; the bounds of the actions are those of the buffer's action space
+        :param options: options of :meth:`from_arrays`; bounds of the actions that it does not name are the buffer's
         :return: the dataset
         :raises DatasetSecurityError: for the path of a saved buffer without ``trust="pickle"``
         :raises DatasetError: if it is no such buffer, or its numbers make no sense
@@ -247,10 +247,10 @@ class Transitions:
         if isinstance(buffer, str | PathLike):
             buffer = load_saved_buffer(buffer, trust)
         arrays, space = arrays_from_replay_buffer(buffer), buffer.action_space
-        bounds = {"action_low": np.ravel(space.low), "action_high": np.ravel(space.high)}
+        options |= bounds_left_open(options, {"action_low": np.ravel(space.low), "action_high": np.ravel(space.high)})
         spec = options.pop("spec", None)
         dataset_id = spec.id if spec else "arrays"
-        return cls._build(arrays, dataset_id, CORE_KEYS, spec, ReadOptions.of({**bounds, **options}))
+        return cls._build(arrays, dataset_id, CORE_KEYS, spec, ReadOptions.of(options))
 
     @classmethod
     def from_minari(cls, name: str | PathLike[str], *, flatten: Flatten = False, **options: Any) -> Transitions:
@@ -263,18 +263,15 @@ class Transitions:
             dataset, its ``metadata.json`` or ``main_data.hdf5``
         :param flatten: of observations that consist of several arrays: True joins all in the order of the observation space,
             keys such as ``["observation", "desired_goal"]`` join these in this order
-        :param options: fields of :class:`~sb3_dce.data.records.ReadOptions`; the bounds of the actions are those of the
-            dataset's action space
+        :param options: fields of :class:`~sb3_dce.data.records.ReadOptions`; bounds of the actions that it does not name are
+            those of the dataset's action space
         :return: the dataset
         :raises DatasetNotFoundError: if it is not on this machine; the message says how to download it
         :raises ConfigError: if ``flatten`` does not fit, or a package is missing that the format of the data needs
         :raises DatasetError: if it is damaged or dangerous, an observation is no vector, or its numbers make no sense
         """
         dataset = find_minari(name)
-        bounds = action_bounds(dataset)
-        if not any(options.get(key) is not None for key in ("action_low", "action_high", "action_scale")):
-            options |= bounds
-        read_options = ReadOptions.of(options)
+        read_options = ReadOptions.of({**options, **bounds_left_open(options, action_bounds(dataset))})
 
         def read() -> BuiltRows:
             with open_episodes(dataset, flatten, read_options.max_bytes) as (sources, found):
@@ -284,7 +281,7 @@ class Transitions:
             info = replace(built.info, findings=(*found, *reward_findings(dataset.name), *built.info.findings))
             return built._replace(info=info)
 
-        if dataset.data_format != "hdf5":  # many files: the hash of none of them would notice a change of the others
+        if dataset.data_format != "hdf5":  # many files, which the cache does not know
             return cls._of(read())
         reader = {"name": "minari", "flatten": flatten, "metadata": file_sha256(dataset.folder / METADATA_FILE)}
         built = cached_rows(dataset.file, None, read_options, reader, read)
@@ -338,37 +335,27 @@ class Transitions:
 
     @property
     def observations(self) -> np.ndarray:
-        """
-        :return: s, shape (n, obs_dim)
-        """
+        """States s in which the actions were taken, a read-only view of shape (n, obs_dim)."""
         return self.rows[:, self._layout.observations]
 
     @property
     def actions(self) -> np.ndarray:
-        """
-        :return: a, shape (n, act_dim)
-        """
+        """Actions a in the units of the environment, not yet scaled to [-1, 1]; a read-only view of shape (n, act_dim)."""
         return self.rows[:, self._layout.actions]
 
     @property
     def rewards(self) -> np.ndarray:
-        """
-        :return: r, reward units, shape (n,)
-        """
+        """Rewards r of the data, before an agent's scale and shift, reward units; a read-only view of shape (n,)."""
         return self.rows[:, self._layout.rewards.start]
 
     @property
     def terminals(self) -> np.ndarray:
-        """
-        :return: d, 1.0 at true terminals, shape (n,)
-        """
+        """Flags d: 1.0 at true terminals, 0.0 elsewhere, at timeouts, too; a read-only float32 view of shape (n,)."""
         return self.rows[:, self._layout.terminals.start]
 
     @property
     def next_observations(self) -> np.ndarray:
-        """
-        :return: s', shape (n, obs_dim)
-        """
+        """States s' that followed the actions, whose value enters the TD target; a read-only view of shape (n, obs_dim)."""
         return self.rows[:, self._layout.next_observations]
 
     def to_hdf5(self, path: str | PathLike[str]) -> None:
@@ -423,7 +410,9 @@ class Transitions:
 
     def spaces_text(self) -> str:
         """
-        :return: the spaces that these data stand for where no environment is given, in words
+        Widths and bounds of the spaces that an agent made without an environment takes from these data.
+
+        :return: in words, without a full stop; bounds that all entries of an action share are named once
         """
         low, high = self.info.action_space_low, self.info.action_space_high
         bounds = [f"[{a:.4g}, {b:.4g}]" for a, b in zip(low, high, strict=True)]

@@ -8,21 +8,22 @@ import numpy as np
 
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.judging import HELD, NOT_HELD, UNTESTED, Values, Verdict, judge, spreads_beyond
-from sb3_dce.experiments.paper import PAPER_SEEDS, gym_rows, leaders, paper_score, paper_scores, paper_total
+from sb3_dce.experiments.paper import PAPER_SEEDS, TABLES, gym_rows, leaders, paper_score, paper_scores, paper_total
 from sb3_dce.experiments.run_times import RunTime, fastest_runs
 from sb3_dce.experiments.statistics import sample_std
 from sb3_dce.experiments.text_table import TextTable
 
-TABLES = ("table1", "table-adroit-kitchen")
 ADROIT = [f"{task}-{kind}-v0" for kind in ("human", "cloned") for task in ("pen", "hammer", "door", "relocate")]
 KITCHEN = ["kitchen-complete-v0", "kitchen-partial-v0", "kitchen-mixed-v0"]
 
 
 def claim_table(evidences: Mapping[str, Evidence], judged: Mapping[str, list[Verdict]]) -> TextTable:
     """
+    The paper's claims C1 to C11 and their outcome on our rows; one that could not be tested says why.
+
     :param evidences: by experiment
     :param judged: verdicts by experiment
-    :return: the paper's claims C1 to C11 and their outcome on our rows
+    :return: label, claim, outcome and the numbers it rests on
     """
     rows = [
         ("C1", "the ranking of actions inside the data is little changed", UNTESTED, "no experiment of the paper shows it"),
@@ -41,6 +42,8 @@ def claim_table(evidences: Mapping[str, Evidence], judged: Mapping[str, list[Ver
 
 def own_table_facts() -> TextTable:
     """
+    Remarks M1 to M16 on where the paper's text, tables and captions contradict each other or leave something out.
+
     :return: what the paper's printed numbers say, computed from them, and slips of the text
     """
     rows = gym_rows()

@@ -103,6 +103,9 @@ def _collect(ray: Any, specs: Sequence[RunSpec], console: Console) -> list[BaseE
         spec = waiting.pop(ready)
         try:
             outcome: Outcome = ray.get(ready)
+        except ray.exceptions.RayTaskError as error:
+            failures.append(not_begun(spec.name, error))
+            continue
         except ray.exceptions.RayError as error:
             failures.append(NodeError(f"{spec.name} was lost with its node: {str(error).splitlines()[0]}", hint=AGAIN))
             continue
@@ -119,6 +122,19 @@ AGAIN = "The same command goes on with what is missing."
 
 class NodeError(SB3DCEError):
     """A run failed on a node of the cluster."""
+
+
+def not_begun(name: str, error: BaseException) -> NodeError:
+    """
+    Error of a run that its node could not even begin; once it has begun, :func:`train_on_node` says what went wrong.
+
+    :param name: of the run
+    :param error: ``RayTaskError``, a report from the node whose last line is the cause
+    :return: what is to be raised
+    """
+    cause = str(error).strip().splitlines()[-1]
+    hint = f"Each node needs this package, in the same version. {AGAIN}"
+    return NodeError(f"{name} could not be begun on its node: {cause}", hint=hint)
 
 
 def asker_of(spec: RunSpec) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_dce.experiments.captions import caption_of
-from sb3_dce.experiments.evidence import Evidence
+from sb3_dce.experiments.evidence import Evidence, mean_over_seeds
 from sb3_dce.experiments.grid import Variant
 from sb3_dce.experiments.judging import CLEARLY, CLOSE, Uncertainty, differs, uncertainty
 from sb3_dce.experiments.text_table import TextTable
@@ -76,10 +76,10 @@ def diagnostics_table(evidence: Evidence) -> TextTable:
         if not len(evidence.rows_of(dce, name)):
             continue
         terminals, reward = (evidence.start(dce, name, f"data_{what}") for what in ("n_terminals", "reward_mean"))
-        half, end = halves(evidence, dce, name)
+        middle, end = middle_and_end(evidence, dce, name)
         cells = [terminals, reward, lowest_margin(evidence, dce, name)]
         cells += [evidence.tail(dce, name, m) for m in ("beta_eff", "gap_td", "q_data", "action_dist", "ent_coef")]
-        rows.append((name, *(_number(value) for value in (*cells, half, end))))
+        rows.append((name, *(_number(value) for value in (*cells, middle, end))))
     header = (
         *("data", "terminals", "mean reward", "smallest survival margin", "beta_eff", "gap_td", "Q on the data"),
         *("distance of actions", "alpha", "score at 40 to 60 %", "score at the end"),
@@ -140,9 +140,9 @@ def verdict_of(evidence: Evidence, dataset_id: str) -> str:
             continue
         if differs(score - dce, uncertain(v), own) is True:
             causes.append(f"{name} closes {(score - dce) / gap:.0%}")
-    half, end = halves(evidence, variant, dataset_id)
-    if half is not None and end is not None and abs(end - half) >= SHARE * gap:
-        causes.append(f"{'still rising' if end > half else 'falling'} ({half:.1f} in the middle of the run)")
+    middle, end = middle_and_end(evidence, variant, dataset_id)
+    if middle is not None and end is not None and abs(end - middle) >= SHARE * gap:
+        causes.append(f"{'still rising' if end > middle else 'falling'} ({middle:.1f} in the middle of the run)")
     if (longer := evidence.last_of_longer(variant, dataset_id)) is not None:
         n = len(longer[0])
         causes.append(f"{longer[0].mean():.1f} after {longer[1]:,} steps ({n} seed{'s' if n > 1 else ''})")
@@ -171,7 +171,7 @@ def lowest_margin(evidence: Evidence, variant: Variant, dataset_id: str) -> floa
     return None if curve.empty else float(np.nanmin(curve.to_numpy()))
 
 
-def halves(evidence: Evidence, variant: Variant, dataset_id: str) -> tuple[float | None, float | None]:
+def middle_and_end(evidence: Evidence, variant: Variant, dataset_id: str) -> tuple[float | None, float | None]:
     """
     Mean scores in the middle and at the end of the runs, by which a finding says rising or falling.
 
@@ -180,11 +180,10 @@ def halves(evidence: Evidence, variant: Variant, dataset_id: str) -> tuple[float
     :param dataset_id: data
     :return: mean score of the evaluations between 40 and 60 % of the run, and in its last tenth; ``None`` without any there
     """
-    curve, n_updates = evidence.curve(variant, dataset_id, "score"), evidence.n_updates(dataset_id) or 0
-    shares = curve.index / max(1, n_updates)
-    middle, end = curve[(shares >= 0.4) & (shares <= 0.6)], curve[shares > 0.9]
-    means = [None if part.empty else float(part.mean().mean()) for part in (middle, end)]
-    return means[0], means[1]
+    curve = evidence.curve(variant, dataset_id, "score")
+    shares = curve.index / (evidence.n_updates(dataset_id) or 1)
+    middle = curve[(shares >= 0.4) & (shares <= 0.6)]
+    return mean_over_seeds(middle), evidence.tail_mean(curve, dataset_id)
 
 
 def _number(value: float | None) -> str:

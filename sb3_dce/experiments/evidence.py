@@ -231,7 +231,9 @@ class Evidence:
         """SHA-256 of the version of a file that is taken, the same for all parts of the experiment."""
         known = self._whole._sha_of
         if dataset_id not in known:
-            hashes = runs_in(self._whole._on_any_file(dataset_id))["dataset_sha256"]
+            # a run that stands for other variants, too, is there under their hashes: its hyperparameters are always its own
+            key = ["hyperparameters" if column == "config_hash" else column for column in RUN_KEY]
+            hashes = self._whole._on_any_file(dataset_id)[key].drop_duplicates()["dataset_sha256"]
             here = self._hash_here(dataset_id) if hashes.nunique() > 1 else None
             known[dataset_id] = here if here is not None and here in set(hashes) else _commonest(hashes)
         return known[dataset_id]
@@ -369,9 +371,10 @@ class Evidence:
         Standard deviation that agents with too few seeds for one of their own borrow: the largest of any agent on these data.
 
         :param dataset_id: data
-        :return: of an agent's last scores over seeds, of any length; 0 where no agent has two seeds
+        :return: of an agent's last scores over seeds, of any length; 0 where no agent has two seeds. A part of the evidence
+            (:meth:`among`) borrows from all of it: two claims on one agent take the same deviation
         """
-        rows = self._of_any_length(dataset_id)
+        rows = self._whole._of_any_length(dataset_id)
         ends = rows[(rows["metric"] == "score") & (rows["step"] == rows["n_updates"])]
         stds = ends.groupby(["agent", "config_hash", "n_updates"], observed=True)["value"].std(ddof=1).dropna()
         return float(stds.max()) if len(stds) else 0.0
@@ -388,16 +391,6 @@ class Evidence:
         :return: one per run that has it there, in the order of the seeds
         """
         return at_end(self.rows_of(variant, dataset_id), metric)
-
-    def last_of_other_length(self, variant: Variant, dataset_id: str) -> tuple[np.ndarray, int] | None:
-        """
-        Scores that a table shows as "after n", for a variant whose runs are all of another length than the row's.
-
-        :param variant: of the experiment
-        :param dataset_id: data
-        :return: scores at the end of the runs of :meth:`of_other_length`, and their gradient steps; ``None`` without any
-        """
-        return _scores_and_length(self.of_other_length(variant, dataset_id))
 
     def start(self, variant: Variant, dataset_id: str, metric: str) -> float | None:
         """
@@ -420,8 +413,7 @@ class Evidence:
         :param dataset_id: data
         :return: runs; 0 without any
         """
-        rows = self.rows_of(variant, dataset_id)
-        return int((rows["metric"] == "diverged").sum())
+        return n_diverged_in(self.rows_of(variant, dataset_id))
 
     def has_ended(self, variant: Variant, dataset_id: str) -> bool:
         """
@@ -463,9 +455,7 @@ class Evidence:
         :param dataset_id: data of its runs
         :return: mean over the last tenth and over seeds; ``None`` without values in it
         """
-        late = curve[curve.index > (1.0 - TAIL) * (self.n_updates(dataset_id) or 0)]
-        # each seed counts the same, however often it was evaluated
-        return float(late.mean().mean()) if late.notna().any(axis=None) else None
+        return mean_over_seeds(curve[curve.index > (1.0 - TAIL) * (self.n_updates(dataset_id) or 0)])
 
     # -- theory ----------------------------------------------------------------------------------------------------
 
@@ -563,6 +553,37 @@ def curve_of(rows: pd.DataFrame, metric: str) -> pd.DataFrame:
     """
     rows = rows[(rows["metric"] == metric) & (rows["step"] > 0)]
     return rows.pivot(index="step", columns="seed", values="value").sort_index()
+
+
+def mean_over_seeds(curve: pd.DataFrame) -> float | None:
+    """
+    Mean of a curve or of a part of one; each seed counts the same, however often it was evaluated.
+
+    :param curve: one column per seed, indexed by gradient steps
+    :return: in the metric's units; ``None`` without values
+    """
+    return float(curve.mean().mean()) if curve.notna().any(axis=None) else None
+
+
+def of_seeds_that_ended(curve: pd.DataFrame, n_updates: int) -> pd.DataFrame:
+    """
+    The part of a curve that is of the same seeds at every step; those that diverged would move a mean where they leave it.
+
+    :param curve: one column per seed, indexed by gradient steps
+    :param n_updates: length of the runs
+    :return: columns of the seeds with a value at the end; empty without any
+    """
+    return curve.loc[:, curve.reindex([n_updates]).notna().iloc[0]].dropna(how="all")
+
+
+def n_diverged_in(rows: pd.DataFrame) -> int:
+    """
+    Number of runs among rows that diverged.
+
+    :param rows: of one agent and data
+    :return: runs; 0 without any
+    """
+    return int((rows["metric"] == "diverged").sum())
 
 
 def _usual_length(runs: pd.DataFrame) -> int:

@@ -12,7 +12,7 @@ from sb3_dce.data.catalog import resolve
 from sb3_dce.errors import ConfigError
 from sb3_dce.experiments.curves import panel_curves, variants_of, view_of
 from sb3_dce.experiments.evidence import UPDATES_PER_EPOCH, Evidence
-from sb3_dce.experiments.grid import Panel
+from sb3_dce.experiments.grid import Panel, planned_id
 from sb3_dce.experiments.statistics import performance_profile
 from sb3_dce.experiments.tables import common_rows, compared, n_diverged
 
@@ -169,19 +169,15 @@ def _data_title(evidence: Evidence, panel: Panel) -> str | None:
     """Id of the data shown; without runs that of those the scale would take."""
     if panel.over:
         return None
-    return evidence.id_of(panel.dataset) or _planned_id(evidence, panel.dataset)
-
-
-def _planned_id(evidence: Evidence, paper: str | None) -> str:
-    """Id of the data that the scale would take."""
-    entry = evidence.entry(paper)
-    return entry.twin if evidence.scale.source == "twin" and entry.twin else entry.paper
+    return evidence.id_of(panel.dataset) or planned_id(evidence.entry(panel.dataset), evidence.scale.source)
 
 
 def _missing(evidence: Evidence, panel: Panel, curves: dict[str, tuple[pd.DataFrame, pd.Series | None]]) -> list[str]:
     """Lines that belong to a panel and have no runs of its length."""
     if panel.over:
-        return [_planned_id(evidence, name) for name in panel.over if evidence.id_of(name) not in curves]
+        entries = [evidence.entry(paper) for paper in panel.over if evidence.id_of(paper) not in curves]
+        planned = dict.fromkeys(planned_id(entry, evidence.scale.source) for entry in entries)
+        return [name for name in planned if name not in curves]  # at smoke scale one file stands for all
     if panel.lines:
         return []
     return [name for name in variants_of(evidence, panel) if name not in curves]

@@ -24,8 +24,8 @@ from sb3_dce.agents import agent_class
 from sb3_dce.checks import did_you_mean
 from sb3_dce.configuration import config_hash, differences
 from sb3_dce.data.catalog import resolve
-from sb3_dce.data.locate import known_dataset, search
-from sb3_dce.errors import ConfigError, DatasetNotFoundError
+from sb3_dce.data.locate import DATASETS_VARIABLE, search
+from sb3_dce.errors import ConfigError, DatasetError, DatasetNotFoundError
 from sb3_dce.run_files import RunSpec
 from sb3_dce.schedules import StepSchedule
 
@@ -89,7 +89,7 @@ class GridDataset:
         """
         What tables and panels say where there are no results: "no data" for a set without a twin, else "not run".
 
-        :return: "no data" for Kitchen, since there can be none without D4RL's file
+        :return: "no data" for Kitchen, where only D4RL's file can give some; a page says the same on every machine
         """
         return "no data" if self.twin is None else "not run"
 
@@ -217,12 +217,12 @@ def experiment_ids() -> list[str]:
     """
     Names of all experiments that have a grid, in the order of the page of results.
 
-    :return: names; those that the order does not have come last
+    :return: names; those that the order does not have come last, by their letters
     """
     order = ["table1", "table-adroit-kitchen", "run-times", "fig-tau", "fig-beta", "fig-ood", "fig-alpha", "fig-cql-q"]
     order += ["fig-cql-return", "fig-sac", "fig-alpha-return", "bounds", "config-tables", "why-dce-loses"]
     names = {e.name.removesuffix(".yml") for e in _grids().iterdir() if e.name.endswith(".yml")} - {"scales"}
-    return sorted(names, key=lambda name: order.index(name) if name in order else len(order))
+    return sorted(names, key=lambda name: (order.index(name) if name in order else len(order), name))
 
 
 def load_experiment(experiment_id: str) -> Experiment:
@@ -260,16 +260,17 @@ def expand(
     seeds: Iterable[int] | None = None,
 ) -> list[PlannedRun]:
     """
-    All runs of an experiment, those that others need first.
+    All runs of an experiment, dataset by dataset and seed by seed.
 
     :param experiment: what is made
     :param scale: how much of it
     :param root: folder below which the runs have their folders
     :param datasets: only these of its datasets, by any of their ids; ``None`` for all
     :param seeds: instead of those of the scale
-    :return: runs; a dataset for which there can be no data (Kitchen without D4RL's files) has none
+    :return: runs, which say themselves whether they need another; a dataset for which there can be no data (Kitchen without
+        D4RL's files) has none
     :raises ConfigError: if one of ``datasets`` is not in the grid
-    :raises DatasetNotFoundError: if a file is missing; the message names the command that makes it
+    :raises DatasetNotFoundError: if a file is missing; the message names the commands that get or make it
     """
     chosen = _chosen(experiment, datasets)
     numbers = range(scale.seeds) if seeds is None else list(seeds)
@@ -371,39 +372,56 @@ def _chosen(experiment: Experiment, datasets: Sequence[str] | None) -> list[Grid
     by_id = {name: d for d in experiment.datasets for name in d.ids}
     wanted = []
     for name in datasets:
-        spec = known_dataset(name)
-        wanted.append(name if spec is None else spec.id)
+        try:
+            wanted.append(resolve(name).id)  # no path: the file of that id in the known folders would be taken, not this one
+        except DatasetError:
+            wanted.append(name)
         if wanted[-1] not in by_id:
-            hint = f"It has {', '.join(by_id)}; present, by itself, takes those that are here."
+            hint = f"It has {', '.join(by_id)}; present, by itself, takes those that are here. A file is named by its id and "
+            hint += f"found in the folders of ${DATASETS_VARIABLE}."
             raise ConfigError(f"{experiment.id} has no dataset {wanted[-1]!r}", key="--datasets", hint=hint)
     return [d for d in experiment.datasets if any(by_id[name] is d for name in wanted)]
 
 
+def planned_id(dataset: GridDataset, source: str) -> str:
+    """
+    Id of the data that a scale takes for a dataset, whether there are results or not.
+
+    :param dataset: of the grid
+    :param source: of a scale
+    :return: of the data that may stand for it the first whose file is here; the first of all if none is
+    """
+    names = _ids_for(dataset, source)
+    return next((name for name in names if search(resolve(name)) is not None), names[0])
+
+
+def _ids_for(dataset: GridDataset, source: str) -> tuple[str, ...]:
+    """Ids of the data that a scale lets stand for a dataset, the first choice first."""
+    if source == "embedded":
+        return (EMBEDDED,)
+    return dataset.ids if source == "d4rl" else dataset.ids[-1:]  # D4RL's own, too, where there is no twin to prefer
+
+
 def _file_of(dataset: GridDataset, source: str, asked_for: bool) -> str | None:
     """Id of the data that stand for a dataset, None where none can be had without D4RL's file."""
-    if source == "embedded":
-        return EMBEDDED
-    if source == "d4rl" and search(resolve(dataset.paper)) is not None:
-        return dataset.paper
-    if dataset.twin is not None and search(resolve(dataset.twin)) is not None:
-        return dataset.twin
+    file_id = planned_id(dataset, source)
+    if search(resolve(file_id)) is not None:
+        return file_id
+    if dataset.twin is None and not asked_for:
+        return None
+    names = _ids_for(dataset, source)
+    what = "the file is not here"
     if dataset.twin is None:
-        if source == "twin" and search(resolve(dataset.paper)) is not None:
-            return dataset.paper  # there is no twin to prefer
-        if not asked_for:
-            return None
-        raise DatasetNotFoundError(
-            f"no data: {dataset.paper} has no twin of our own and D4RL's file is not here",
-            where=dataset.paper,
-            key=dataset.paper,
-            hint=f"Run: sb3-dce datasets download {dataset.paper}",
-        )
+        what += ", and no data of our own stand for it"
+    elif len(names) > 1:
+        what += f", nor is that of its twin {dataset.twin}"
+    commands = [f"sb3-dce datasets {'generate' if resolve(name).generated else 'download'} {name}" for name in names]
     raise DatasetNotFoundError(
-        "the file is not here",
-        where=f"dataset {dataset.twin}",
-        key=dataset.twin,
-        hint=f"Run: sb3-dce datasets generate {dataset.twin} - or take those that are here with --datasets, or all of them "
-        "with --datasets present",
+        what,
+        where=f"dataset {file_id}",
+        key=file_id,
+        hint=f"Run: {', or '.join(commands)} - or take those that are here with --datasets, or all of them with "
+        "--datasets present",
     )
 
 

@@ -28,7 +28,8 @@ SEED_STD_FREEDOM = 4
 CLEARLY = (
     "outside of the 95 % interval of Welch's test over seeds, where an agent with fewer than three has the largest standard "
     f"deviation of these: {SEED_STD:g} (DCE on HalfCheetah, five seeds), that of the paper's DCE on such data (five seeds), "
-    "those of the experiment's agents with two seeds or more on these data, after any number of steps"
+    "those of the experiment's agents with two seeds or more on these data, after any number of steps; deviations are those "
+    "of last scores, also where means over the last tenth of the run are compared, which as a rule spread less"
 )
 # Seeds from which on an agent's own deviation is taken.
 FEWEST_OWN = 3
@@ -90,7 +91,7 @@ class Values(dict[str, float]):
 
     :ivar scope: data, length and seeds they rest on
     :ivar other_kind: how the data differ in kind from those that the paper's claim is about; empty if they do not
-    :ivar errors: uncertainty over seeds of each, for scores
+    :ivar errors: uncertainty over seeds of each; only scores have one
     """
 
     scope = ""
@@ -136,7 +137,8 @@ def values_of(evidence: Evidence, names: list[str], metric: str, dataset: str | 
         if value is None:
             return None
         values[variant.name] = value
-        values.errors[variant.name] = uncertainty(evidence, view.last(variant, dataset_id), dataset_id)
+        if metric == "score":
+            values.errors[variant.name] = uncertainty(evidence, view.last(variant, dataset_id), dataset_id)
     values.scope = view.scope(dataset_id, variants)
     values.other_kind = view.other_kind(dataset)
     return values

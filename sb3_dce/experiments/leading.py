@@ -36,8 +36,8 @@ def leading(evidence: Evidence) -> list[Verdict]:
 
 class Field:
     """
-    DCE and all other agents of the paper on some of the table's data: the paper's own files if they are all there, else ours,
-    never some of both.
+    DCE and all other agents of the paper on some of the table's data: on the paper's own files or on ours, never some of both.
+    Those count on which DCE was run on more of the sets, of equally many the paper's.
 
     :param evidence: of a table
     :param wanted: rows of the table that the claim is about

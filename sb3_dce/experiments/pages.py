@@ -58,7 +58,7 @@ def write_page(
         "each number. Its schedules change beta for the first time after 50,000 steps: shorter runs have the first beta "
         "throughout.",
         *coverage(evidences),
-        '"Not run": there are no runs yet. "No data": this needs files of D4RL, which are not here, and has no stand-in '
+        '"Not run": there are no runs yet. "No data": nor can there be any without files of D4RL, which have no stand-in '
         '(Kitchen). "No curve": this line of a figure has no runs of the length of the others.',
         f"Verdicts in the sections of the experiments: {count(every)}.",
         f'In the rules below "clearly" means {CLEARLY}.',

@@ -16,6 +16,7 @@ from sb3_dce.experiments.statistics import Total, total
 
 METHODS = ("BC", "UWAC", "PBRL", "IQL", "TD3-BC", "CQL", "DCE")
 PAPER_SEEDS = 5
+# Experiment to table of ``paper_scores.csv``.
 TABLES = {"table1": "gym", "table-adroit-kitchen": "adroit_kitchen"}
 MIXED_PROTOCOLS = "The paper's baselines are copied from other papers, with other protocols."
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -101,13 +100,13 @@ class Request:
 
 def parse_ids(text: str) -> tuple[str, ...]:
     """
-    Experiments in the order in which they are named; "all" has that of the results page.
+    Experiments in the order in which they are named, each once; "all" has that of the results page.
 
     :param text: an experiment, several separated by commas, or "all"
     :return: names
     :raises ConfigError: for an unknown one, for none, and for "all" among others
     """
-    names = tuple(name.strip() for name in text.split(",") if name.strip())
+    names = tuple(dict.fromkeys(name.strip() for name in text.split(",") if name.strip()))
     if not names:
         raise ConfigError("no experiment is named", key="id", hint="See sb3-dce reproduce --list, or take all.")
     if ALL in names and names != (ALL,):
@@ -150,7 +149,7 @@ def reproduce(request: Request, console: Console) -> dict[str, Report]:
         evidence = Evidence(experiment, rows, scales[experiment.id], length, hash_here)
         evidences[experiment.id], reports[experiment.id] = evidence, _report(evidence, request.out, console)
     if request.page is not None:
-        write_page(request.page, request.out, evidences, reports, request.scale, _command(request))
+        write_page(request.page, request.out, evidences, reports, request.scale, command_of(request))
         console.print(f"page   {request.page}", markup=False)
     raise_first(errors, console)
     return reports
@@ -257,12 +256,13 @@ def scale_of(experiment: Experiment, request: Request) -> Scale:
     :param experiment: one of the request's
     :param request: with its changes of length, evaluations and seeds
     :return: the scale with them
-    :raises ConfigError: if the last evaluation would not be at the end
+    :raises ConfigError: if the last evaluation of what is trained would not be at the end
     """
     scale = experiment.scales[request.scale]
     updates = request.updates or scale.updates
     every = request.eval_freq or min(scale.eval_freq, updates)
-    check_ends_with_evaluation(updates, every)
+    if not request.report_only:  # runs that are there say themselves when they were evaluated
+        check_ends_with_evaluation(updates, every)
     scale = replace(scale, updates=updates, eval_freq=every)
     return scale if request.seeds is None else replace(scale, seeds=request.seeds)
 
@@ -274,7 +274,7 @@ def plan_runs(experiment: Experiment, scale: Scale, request: Request) -> list[Pl
     :param experiment: one of the request's
     :param scale: with the request's changes
     :param request: with its choice of data, agents and seeds
-    :return: runs, those that others need first
+    :return: runs, in the order of the grid; those that a chosen one needs are among them, whether they are chosen or not
     :raises ConfigError: for an agent or a dataset that is not in the grid
     """
     if not experiment.datasets:
@@ -294,7 +294,8 @@ def plan_runs(experiment: Experiment, scale: Scale, request: Request) -> list[Pl
     if unknown := sorted(wanted - headings - algos):
         hint = f"It has {'; '.join(sorted(headings))}, or all forms of {', '.join(sorted(algos))}."
         raise ConfigError(f"{experiment.id} has no agent {unknown[0]!r}", key="--agents", hint=hint)
-    return [run for run in planned if {run.variant, run.spec.algo} & wanted]
+    needed = {run.needs for run in planned if {run.variant, run.spec.algo} & wanted}
+    return [run for run in planned if {run.variant, run.spec.algo} & wanted or run.spec.folder in needed]
 
 
 def _with_precision(spec: RunSpec, precision: str) -> RunSpec:
@@ -400,7 +401,29 @@ def _show(name: str, header: tuple[str, ...], rows: tuple[tuple[str, ...], ...],
         console.print("; ".join(missing), markup=False)
 
 
-def _command(request: Request) -> str:
-    if Path(sys.argv[0]).name == "sb3-dce":
-        return shlex.join(["sb3-dce", *sys.argv[1:]])
-    return f"sb3-dce reproduce {','.join(request.ids)} --report-only --out {request.out}"
+def command_of(request: Request) -> str:
+    """
+    The call that makes the same page again, for a shell; where and by how many processes runs are trained is left out.
+
+    :param request: any, also of a program
+    :return: ``sb3-dce reproduce`` with what differs from its defaults, and always with scale and folder
+    """
+    sign = ";" if any("," in name for name in request.agents) else ","
+    options: dict[str, object] = {
+        "--datasets": ",".join(request.datasets),
+        "--agents": "".join(f"{name}{sign}" for name in request.agents).removesuffix(","),
+        "--seeds": request.seeds,
+        "--first-seed": request.first_seed,
+        "--updates": request.updates,
+        "--eval-freq": request.eval_freq,
+        "--precision": "" if request.precision == "float32" else request.precision,
+    }
+    folders = {"--reuse": request.reuse, "--import": request.imports}
+    words = ["sb3-dce", "reproduce", ALL if request.ids == tuple(experiment_ids()) else ",".join(request.ids)]
+    words += ["--scale", request.scale]
+    words += [word for option, value in options.items() if value for word in (option, str(value))]
+    words += ["--report-only"] if request.report_only else []
+    words += ["--out", str(request.out)]
+    words += [word for option, paths in folders.items() for path in paths for word in (option, str(path))]
+    words += ["--page", str(request.page)] if request.page is not None else []
+    return shlex.join(words)

@@ -24,7 +24,7 @@ from sb3_dce.data import find_file
 from sb3_dce.data.catalog import resolve
 from sb3_dce.data.hashes import sha256_once
 from sb3_dce.data.locate import catalogue_id, short_name
-from sb3_dce.errors import CheckpointError, SB3DCEError
+from sb3_dce.errors import CheckpointError, ConfigError, SB3DCEError
 from sb3_dce.evaluation import Evaluation, read_evaluations
 from sb3_dce.experiments.grid import PlannedRun
 from sb3_dce.files import write_atomically
@@ -56,6 +56,7 @@ PROBE_CURVE = re.compile(r"probe\d+_(data|policy|init|best|max|min)")
 # A curve of diagnostics has at most POINTS points, each the mean since the last; a short run has wider gaps than FINEST steps
 # only for FEWEST_POINTS.
 POINTS, FEWEST_POINTS, FINEST = 100, 25, 2000
+AGAIN = "Make the file again from the run folders, or take it anew from where it came."
 # Episodes of the paper's evaluation: four in its Gym table, five in the text for the others.
 PAPER_EPISODES = {"gym": 4, "adroit": 5, "kitchen": 5}
 
@@ -70,8 +71,9 @@ def rows_of_run(folder: Path, experiment: str) -> pd.DataFrame | None:
 
     :param folder: of one run, as :func:`sb3_dce.runs.run` writes it
     :param experiment: id of the experiment it is run for
-    :return: its rows; ``None`` unless it is complete or has diverged
+    :return: its rows; ``None`` unless it is complete or has diverged; one that diverged while it was made longer has diverged
     :raises CheckpointError: if a file is damaged
+    :raises ConfigError: if it is of an agent that this version does not have
     """
     config, result, divergence = read_config(folder), read_result(folder), read_divergence(folder)
     if config is None or (result is None and divergence is None):
@@ -79,7 +81,8 @@ def rows_of_run(folder: Path, experiment: str) -> pd.DataFrame | None:
     try:
         run, data = config["run"], config["dataset"]
         dataset_id = catalogue_id(data["name"])
-        n_updates = int(run["n_updates"] if result is None else result["n_updates"])
+        # a complete run may be on its way to become a longer one
+        n_updates = int(run["n_updates"] if result is None or divergence is not None else result["n_updates"])
         commit = config["versions"].get("commit")
         common = {
             "experiment": experiment,
@@ -93,8 +96,10 @@ def rows_of_run(folder: Path, experiment: str) -> pd.DataFrame | None:
             "code_version": config["versions"]["sb3_dce"] + (f"+{commit}" if commit else ""),
             "device": _device(config),
         }
-        values = [*_facts(folder, config, result, divergence, n_updates), *_curves(folder, n_updates)]
+        values = [*_facts(data, result, divergence, n_updates), *_curves(folder, n_updates)]
         values += _evaluations(folder, dataset_id, n_updates)
+    except ConfigError as error:
+        raise ConfigError(error.what, where=str(folder), hint=error.hint, key=error.key) from error
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(
             f"the folder is not that of a run of this package: {error!r}",
@@ -210,7 +215,7 @@ def write_rows(path: Path, rows: pd.DataFrame) -> None:
     """
     check_rows(rows, str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
-    ordered = rows.sort_values([*PLAN_KEY, "metric", "step"], kind="stable")
+    ordered = rows.sort_values([*RUN_KEY, "metric", "step"], kind="stable")
     with write_atomically(path) as stream:
         ordered.to_csv(stream, index=False, compression={"method": "gzip", "mtime": 0}, quoting=csv.QUOTE_MINIMAL)
 
@@ -227,9 +232,7 @@ def read_rows(path: Path) -> pd.DataFrame:
     try:
         rows = pd.read_csv(path, dtype=text, compression="gzip", keep_default_na=False, na_values={"value": [""]})
     except (OSError, EOFError, ValueError, zlib.error) as error:
-        raise ResultsError(
-            f"the file cannot be read: {error}", where=str(path), hint="Take it from the repository."
-        ) from error
+        raise ResultsError(f"the file cannot be read: {error}", where=str(path), hint=AGAIN) from error
     check_rows(rows, str(path))
     return _ordered(rows)
 
@@ -269,7 +272,7 @@ def check_rows(rows: pd.DataFrame, where: str) -> None:
     """
 
     def refuse(what: str) -> None:
-        raise ResultsError(what, where=where, hint="Make the file again from the run folders.")
+        raise ResultsError(what, where=where, hint=AGAIN)
 
     if tuple(rows.columns) != COLUMNS:
         refuse(f"columns are {', '.join(map(str, rows.columns))}; they must be {', '.join(COLUMNS)}")
@@ -303,16 +306,14 @@ def _device(config: dict[str, Any]) -> str:
 
 
 def _facts(
-    folder: Path, config: dict[str, Any], result: dict[str, Any] | None, divergence: dict[str, Any] | None, n_updates: int
+    data: dict[str, Any], result: dict[str, Any] | None, divergence: dict[str, Any] | None, n_updates: int
 ) -> list[tuple[int, str, float]]:
     """Numbers of the whole run, at its last step; of its data, at step 0."""
-    data = config["dataset"]
     facts = [(0, f"data_{name}", float(data[name])) for name in ("rows", "reward_mean", "n_terminals") if name in data]
-    if result is not None:
-        facts.append((n_updates, "seconds", float(result["seconds"])))
-    else:
-        assert divergence is not None
+    if divergence is not None:
         facts.append((int(divergence["n_updates"]), "diverged", 1.0))
+    elif result is not None:
+        facts.append((n_updates, "seconds", float(result["seconds"])))
     return facts
 
 

@@ -114,7 +114,9 @@ def _run_all(
         return [outcome for outcome in launch_all(here, workers, console) if isinstance(outcome, BaseException)]
     begun = begun_populations(specs, planned)
     taken = {spec.folder for group in begun for spec in group}
-    groups = [*begun, *populations(spec for spec in specs if spec.folder not in taken)]
+    rest = [spec for spec in specs if spec.folder not in taken]
+    begun_alone = [spec for spec in rest if (Path(spec.folder) / "checkpoint.zip").is_file()]  # and so they go on
+    groups = [*begun, *([spec] for spec in begun_alone), *populations(spec for spec in rest if spec not in begun_alone)]
     alone = [replace(group[0], device=str(device)) for group in groups if len(group) == 1]
     failures = [outcome for outcome in launch_all(alone, 1, console) if isinstance(outcome, BaseException)]
     for group in (group for group in groups if len(group) > 1):

@@ -35,7 +35,7 @@ def runtime_table(evidence: Evidence) -> TextTable:
         listed.append(variant)
         cell = paper_scores().get(("gym", "runtime-s", variant.paper))
         printed = "-" if cell is None or cell.score is None else f"{cell.score:g}"
-        runs = run_times(evidence, variant, ids)
+        runs = run_times(evidence, variant, evidence.shown(ids, [variant]))
         for device in sorted({run.device for run in runs}, key=lambda device: (" " in device, device)):
             rates = np.array([run.seconds for run in runs if run.device == device])
             spread = f"{rates.min():.1f} to {rates.max():.1f}"
@@ -77,27 +77,26 @@ class RunTime(NamedTuple):
 
     @property
     def text(self) -> str:
-        """Seconds and device; a hastened run says "fewer draws", unless its device has the precision that hastens it."""
-        return f"{self.seconds:.1f} s ({self.device}{', fewer draws' if self.hastened and ' ' not in self.device else ''})"
+        """Seconds, and in brackets the device, as verdicts name the time of an agent."""
+        return f"{self.seconds:.1f} s ({self.device})"
 
 
-def run_times(evidence: Evidence, variant: Variant, dataset_ids: list[str]) -> list[RunTime]:
+def run_times(evidence: Evidence, variant: Variant, rows: pd.DataFrame) -> list[RunTime]:
     """
     Times of an agent's runs that were trained alone: members of a population have its time together.
 
-    :param evidence: rows
+    :param evidence: at a scale, whose settings may hasten the agent
     :param variant: agent
-    :param dataset_ids: data
-    :return: of each complete run that is shown, of the row's length or else its longest
+    :param rows: of its runs
+    :return: of each complete run
     """
     # smoke scale has small networks
-    fewer, runs = has_fewer_draws(evidence, variant) or evidence.scale.source == "embedded", []
-    for name in dataset_ids:
-        rows = pd.concat([evidence.rows_of(variant, name), evidence.of_other_length(variant, name)])
-        alone = rows[(rows["metric"] == "seconds") & ~rows["device"].str.contains("population")]
-        for value, n_updates, device in zip(alone["value"], alone["n_updates"], alone["device"], strict=True):
-            runs.append(RunTime(1000.0 * value / n_updates, device, fewer or device.rpartition(" ")[2] in HASTENED))
-    return runs
+    fewer = has_fewer_draws(evidence, variant) or evidence.scale.source == "embedded"
+    alone = rows[(rows["metric"] == "seconds") & ~rows["device"].str.contains("population")]
+    return [
+        RunTime(1000.0 * value / n_updates, device, fewer or device.rpartition(" ")[2] in HASTENED)
+        for value, n_updates, device in zip(alone["value"], alone["n_updates"], alone["device"], strict=True)
+    ]
 
 
 def fastest_runs(evidence: Evidence, names: Iterable[str]) -> dict[str, RunTime]:
@@ -106,13 +105,17 @@ def fastest_runs(evidence: Evidence, names: Iterable[str]) -> dict[str, RunTime]
 
     :param evidence: rows
     :param names: of variants
-    :return: by variant, of its runs with the authors' settings in float32; all on one file and one kind of device, the one
-        with most of the variants
+    :return: by variant, of its runs with the authors' settings in float32; all of one length, since a CPU executes short runs
+        otherwise than long ones, on one file and one kind of device, the one with most of the variants
     """
-    ids = [dataset_id] if (dataset_id := evidence.id_of(None)) is not None else []
+    names = list(names)
+    view = evidence.among(names)
+    if (dataset_id := view.id_of(None)) is None:
+        return {}
     by_device: dict[str, dict[str, RunTime]] = {}
     for name in names:
-        for run in run_times(evidence, evidence.experiment.variant(name), ids):
+        variant = view.experiment.variant(name)
+        for run in run_times(view, variant, view.rows_of(variant, dataset_id)):
             known = by_device.setdefault(run.device, {})
             if not run.hastened and run.seconds <= known.get(name, run).seconds:
                 known[name] = run

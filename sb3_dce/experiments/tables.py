@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pandas as pd
 
 from sb3_dce.data.catalog import resolve
 from sb3_dce.experiments.captions import caption
-from sb3_dce.experiments.evidence import Evidence, at_end, curve_of
+from sb3_dce.experiments.evidence import Evidence, at_end, curve_of, n_diverged_in, of_seeds_that_ended
 from sb3_dce.experiments.grid import Variant, source_of
 from sb3_dce.experiments.paper import MIXED_PROTOCOLS, paper_score, paper_total
 from sb3_dce.experiments.statistics import (
@@ -101,15 +102,14 @@ def score_cell(evidence: Evidence, variant: Variant, dataset_id: str, best: Inte
     :param best: interval of the best mean of the row, ``None`` if that has one seed
     :param usual: commonest number of seeds of the row
     :return: mean, deviation, number of seeds if it is not the usual one, and how many diverged; without runs of the row's
-        length the scores of its longest, marked as such, or "-"
+        length the same of its longest, marked as such, or "-"
     """
+    longest = evidence.of_other_length(variant, dataset_id)
+    if len(longest):
+        return _cell_of_other_length(longest, usual)
     scores, diverged = evidence.last(variant, dataset_id), evidence.n_diverged(variant, dataset_id)
     lost = f" ({diverged} diverged)" if diverged else ""
     if not len(scores):
-        other = evidence.last_of_other_length(variant, dataset_id)
-        if other is not None:
-            n = "" if len(other[0]) == usual else f", {_seeds(other[0])}"
-            return f"{_mean_and_spread(other[0])} (after {other[1]:,}{n})"
         return lost.strip() or "-"
     text = _mean_and_spread(scores)
     if best is not None and not diverged and len(scores) > 1 and mean_interval(scores).overlaps(best):
@@ -117,6 +117,16 @@ def score_cell(evidence: Evidence, variant: Variant, dataset_id: str, best: Inte
     if len(scores) != usual:
         text += f" ({_seeds(scores)})"
     return text + lost
+
+
+def _cell_of_other_length(rows: pd.DataFrame, usual: int) -> str:
+    """Of runs that are compared with nobody."""
+    scores, diverged, after = at_end(rows, "score"), n_diverged_in(rows), f"after {int(rows['n_updates'].iloc[0]):,}"
+    lost = [f"{diverged} diverged"] if diverged else []
+    if not len(scores):
+        return f"({', '.join([*lost, after])})" if lost else "-"
+    number = [] if len(scores) == usual else [_seeds(scores)]
+    return f"{_mean_and_spread(scores)} ({', '.join([after, *number, *lost])})"
 
 
 def _seeds(scores: np.ndarray) -> str:
@@ -287,14 +297,14 @@ def long_table(evidence: Evidence) -> TextTable:
     cells = [(d, name, v) for d, name in evidence.table_rows() for v in evidence.variants(d)]
     for dataset, name, variant in cells:
         for length, runs in evidence.rows_of_any_length(variant, name).groupby("n_updates"):
-            scores, lost = at_end(runs, "score"), int((runs["metric"] == "diverged").sum())
+            scores, lost = at_end(runs, "score"), n_diverged_in(runs)
             if not len(scores) and not lost:
                 continue
             numbers = ["", "", "", "", "", "", "", ""]
             if len(scores):
                 low, high = mean_interval(scores) if len(scores) > 1 else (float("nan"), float("nan"))
                 few = at_end(runs, "score_paper_episodes")
-                curve = curve_of(runs, "score")
+                curve = of_seeds_that_ended(curve_of(runs, "score"), int(runs["n_updates"].iloc[0]))
                 paper_mode = float(few.mean()) if len(few) else float("nan")
                 last_ten = float(curve.tail(10).mean().mean()) if len(curve) >= 10 else float("nan")
                 late = (last_ten, float(curve.max().mean()))

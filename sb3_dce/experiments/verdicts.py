@@ -16,7 +16,7 @@ from sb3_dce.configuration import row_of
 from sb3_dce.dce_probe import PROBE_BETAS
 from sb3_dce.execution import UPDATES_WORTH_COMPILING
 from sb3_dce.experiments.curves import probe_difference, view_of
-from sb3_dce.experiments.evidence import GAMMA, TAIL, TAU, Evidence
+from sb3_dce.experiments.evidence import GAMMA, TAU, Evidence, of_seeds_that_ended
 from sb3_dce.experiments.grid import source_of
 from sb3_dce.experiments.judging import (
     CLOSE,
@@ -75,8 +75,8 @@ def _second_halves(evidence: Evidence, names: list[str], measure: Callable[[np.n
     for name in names:
         if dataset_id is not None and (n_updates := evidence.n_updates(dataset_id)) is not None:
             curve = evidence.curve(evidence.experiment.variant(name), dataset_id, "q_data")
-            half = curve[curve.index > n_updates / 2]
-            if len(half) >= FEWEST_POINTS and half.index[-1] == n_updates:  # else all of its seeds diverged before
+            half = of_seeds_that_ended(curve[curve.index > n_updates / 2], n_updates)
+            if len(half) >= FEWEST_POINTS:  # none if all of its seeds diverged before
                 values[name] = measure(half.mean(axis=1).to_numpy())
     return values
 
@@ -103,8 +103,12 @@ def _has_largest_wave(waves: Values, name: str, level: float) -> bool | str:
     """Whether a curve has a wave that can be seen and is the largest, ``CLOSE`` if another has one about as large."""
     if waves[name] < LARGE_WAVE * abs(level):
         return False
-    ratio = waves[name] / max(wave for other, wave in waves.items() if other != name)
-    return CLOSE if 1 / FLATTER < ratio < FLATTER else ratio > 1
+    return _varies_more(waves[name], max(wave for other, wave in waves.items() if other != name))
+
+
+def _varies_more(one: float, other: float) -> bool | str:
+    """Whether a spread is larger than another, ``CLOSE`` within a factor of ``FLATTER``."""
+    return CLOSE if one <= FLATTER * other and other <= FLATTER * one else one > other
 
 
 def _beta(evidence: Evidence) -> list[Verdict]:
@@ -162,10 +166,9 @@ def _shift(evidence: Evidence) -> list[Verdict]:
             if dataset_id is None:
                 continue
             lowered, theory = evidence.shift(experiment.variant(name), experiment.variant("beta 0"), dataset_id, of)
-            late = lowered.index > (1.0 - TAIL) * (evidence.n_updates(dataset_id) or 0)
-            if lowered.empty or not late.any():
-                continue
-            ratios[name] = float(lowered[late].mean().mean() / theory[late].mean())
+            measured, expected = (evidence.tail_mean(curve, dataset_id) for curve in (lowered, theory.to_frame()))
+            if measured is not None and expected is not None:
+                ratios[name] = measured / expected
         found.append(
             judge(
                 f"{letter} on the data is lowered by (1 - gamma^{power}) / (1 - gamma) beta, in proportion to beta",
@@ -234,7 +237,7 @@ def _alpha(evidence: Evidence) -> list[Verdict]:
     experiment = evidence.experiment
     rising_betas = evidence.among([f"beta {b}" for b in (1, 2, 4)])
     variants = rising_betas.experiment.variants
-    rises: list[bool | str] = []
+    rises: list[bool | str | None] = []
     texts = []
     for dataset, name in rising_betas.table_rows():
         values = Values()
@@ -243,8 +246,8 @@ def _alpha(evidence: Evidence) -> list[Verdict]:
                 values[v.name] = value
         if len(values) > 1 and not dataset.is_other_kind(name):
             logs = np.diff(np.log(list(values.values())))
-            risen = len(values) == len(variants) and bool((logs > ALPHA_STEP).all())
-            rises.append(False if (logs < -ALPHA_STEP).any() else True if risen else CLOSE)
+            risen = None if len(values) < len(variants) else bool((logs > ALPHA_STEP).all()) or CLOSE
+            rises.append(False if (logs < -ALPHA_STEP).any() else risen)
             values.scope = rising_betas.scope(name, variants)
             texts.append(values.text(4))
     rule = (
@@ -319,10 +322,7 @@ def _cql_q(evidence: Evidence) -> list[Verdict]:
     rule = f"in-data Q of expectile 0.5 < 0.7 < 0.9 ({TENTH})"
     found = [judge("A higher expectile gives a higher Q (a slacker estimate)", rule, rising(levels), text_of(levels))]
     slopes = _second_halves(evidence, ["expectile 0.7", "without policy"], lambda curve: float(np.std(curve, ddof=1)))
-    holds: bool | str | None = None
-    if len(slopes) == 2:
-        ratio = slopes["expectile 0.7"] / slopes["without policy"]
-        holds = CLOSE if 1 / FLATTER < ratio < FLATTER else ratio > 1
+    holds = _varies_more(slopes["expectile 0.7"], slopes["without policy"]) if len(slopes) == 2 else None
     rule = f"standard deviation of the curve over its second half is smaller, by more than a factor of {FLATTER:g}"
     return [*found, judge("Without a policy in the penalty Q is flatter", rule, holds, _shape_text(slopes, 2))]
 

@@ -161,8 +161,8 @@ class EpisodeRunner:
         steps, tracks, starts = [], [_Track() for _ in numbers], []
         for env, number, track in zip(self._environments(len(numbers)), numbers, tracks, strict=True):
             first, _ = env.reset(seed=self.spec.seed + number)
-            starts.append(first)
-            track.observations.append(first)
+            starts.append(np.array(first))  # copies, here and below: an environment may overwrite what it gave or got
+            track.observations.append(starts[-1])
             steps.append(env.step)
         obs = np.stack(starts)
         noise, added = (_stacked(parts) for parts in zip(*(self._noise(number) for number in numbers), strict=True))
@@ -171,10 +171,10 @@ class EpisodeRunner:
             actions = self._act(obs, None if noise is None else noise[t], None if added is None else added[t], t)
             for i in running[:]:
                 track = tracks[i]
+                track.actions.append(actions[i].copy())
                 seen, reward, terminated, truncated, _ = steps[i](actions[i])
-                track.actions.append(actions[i])
                 track.rewards.append(reward)
-                track.observations.append(seen)
+                track.observations.append(np.array(seen))
                 obs[i] = seen
                 if terminated or truncated:
                     track.terminated = bool(terminated)

@@ -161,6 +161,10 @@ class _Job:
         return self.folder / self.recipe.dataset.file_name
 
     @property
+    def n_rows(self) -> int | None:
+        return self.recipe.rows if self.rows is None else self.rows
+
+    @property
     def base_seed(self) -> int:
         kind = _KINDS.index(self.recipe.kind) + 1
         return _SEED_STEP * (kind + 10 * self.seed)
@@ -192,7 +196,7 @@ def generate(
     :param folder: where it is written; default: the first folder in which data are looked for
     :param sources: policies and buffers there are
     :param training: how SAC is trained where there are none
-    :param rows: rows to make, default D4RL's number; of a buffer, the first rows
+    :param rows: rows to make, default D4RL's number; of a buffer, the first rows, default all
     :param seed: makes other data of the same kind
     :param workers: processes that record
     :param force: replace an existing file
@@ -201,10 +205,13 @@ def generate(
     :return: what was written
     :raises ConfigError: if the id is unknown or a parameter does not belong to it
     :raises DatasetNotFoundError: if a policy or buffer is missing and cannot be trained here
+    :raises DatasetError: if a buffer or part has fewer rows than are wanted
     """
     recipe = _find_recipe(dataset)
-    if rows is not None and rows < 1:
-        raise ConfigError(f"rows must be at least 1, got {rows}", key="rows", hint="For example --rows 1000000.")
+    fewest = 2 if recipe.source == "parts" else 1
+    if rows is not None and rows < fewest:
+        hint = f"For example --rows {recipe.rows or 1_000_000}."
+        raise ConfigError(f"rows of {recipe.dataset.id} must be at least {fewest}, got {rows}", key="rows", hint=hint)
     sources = sources or Sources()
     for name, value, fitting in (("policy", sources.policy, "policy"), ("buffer", sources.buffer, "buffer")):
         if value is not None and recipe.source != fitting:
@@ -265,12 +272,11 @@ def _from_policy(job: _Job) -> Recorded:
         path = sources.policy or _search(job) or _train(job)
         policy, extra = str(path), _origin(path)
     spec = RecordingSpec(policy, recipe.dataset.id, job.base_seed, algo=sources.algo, vecnormalize=sources.vecnormalize)
-    rows = job.rows or recipe.rows
     return record(
         spec,
         job.out,
-        n_rows=rows,
-        n_episodes=None if rows else recipe.episodes,
+        n_rows=job.n_rows,
+        n_episodes=recipe.episodes if job.n_rows is None else None,
         name=recipe.dataset.id,
         workers=job.workers,
         force=job.force,
@@ -291,32 +297,29 @@ def _from_buffer(job: _Job) -> Recorded:
             extra["behaviour_policy"] = extra.pop("behaviour_source")
     else:
         run = _sac_run(job)
-        arrays = run.replay()
+        path, arrays = run.folder, run.replay()
         extra = {
             "behaviour_policy": f"replay buffer of SAC up to a mean return of {run.target:g}, reached after "
             f"{len(arrays['rewards']):,} steps; seed {job.seed}",
             "behaviour_source": "sb3-dce datasets generate",
         }
-    return _write(job, {key: array[: job.rows] for key, array in arrays.items()}, extra, started)
+    arrays = _first_rows(arrays, job.n_rows, path, "Ask for fewer --rows, or leave it out for all.")
+    return _write(job, arrays, extra, started)
 
 
 def _from_parts(job: _Job) -> Recorded:
     """D4RL's medium-expert: the expert part, cut at its last whole episode, then the medium part."""
     started = time.monotonic()
-    half = (job.rows or job.recipe.rows or 0) // 2
+    assert job.n_rows is not None
+    half = job.n_rows // 2
     parts, extra = [], {}
     for kind in ("expert", "medium"):
         path = _part(job, kind, half)
         with D4RLFile(path) as file:
             attrs = file.attributes()
-        arrays = {key: array[:half] for key, array in _read(path).items()}
-        if len(arrays["rewards"]) < half:
-            raise DatasetError(
-                f"has {len(arrays['rewards']):,} rows, {half:,} are wanted",
-                where=str(path),
-                path=path,
-                hint=f"Make it longer with --rows, or ask for --rows {2 * len(arrays['rewards'])} here.",
-            )
+        arrays = _read(path)
+        hint = f"Make it longer with --rows, or ask for --rows {2 * len(arrays['rewards'])} here."
+        arrays = _first_rows(arrays, half, path, hint)
         if kind == "expert":
             ends = np.flatnonzero(arrays["terminals"] | arrays["timeouts"])
             if not len(ends):
@@ -334,6 +337,13 @@ def _from_parts(job: _Job) -> Recorded:
     extra["behaviour_policy"] = f"first {policies[0]}, then {policies[1]}"
     keys = [key for key in parts[0] if key in parts[1]]
     return _write(job, {key: np.concatenate([part[key] for part in parts]) for key in keys}, extra, started)
+
+
+def _first_rows(arrays: Arrays, n: int | None, path: Path, hint: str) -> Arrays:
+    there = len(arrays["rewards"])
+    if n is not None and there < n:
+        raise DatasetError(f"has {there:,} rows, {n:,} are wanted", where=str(path), path=path, hint=hint)
+    return {key: array[:n] for key, array in arrays.items()}
 
 
 def _part(job: _Job, kind: str, rows: int) -> Path:
@@ -410,7 +420,7 @@ def _sac_run(job: _Job) -> Any:
     # named by the task: the medium, replay and expert sets are stages of one run
     folder = job.folder / "training" / f"{task}-sac-seed{job.seed}"
     target = MEDIUM_TARGETS[task] if job.training.target is None else job.training.target
-    job.note(f"no policy given or found: training SAC in {folder} (about an hour per 300,000 steps on one core)")
+    job.note(f"no {job.recipe.source} given or found: that of the SAC run in {folder}")
     return SACRun(
         f"{task}-medium-sb3",
         target,

@@ -173,9 +173,9 @@ def check_target(out: Path, name: str | None, env: str | None, force: bool) -> s
             key="env",
             hint="Choose another name, or that environment; for Adroit give the dataset id, which adds the corrections.",
         )
+    check_writable(out)
     if out.exists() and not force:
         raise ConfigError("the file exists", where=str(out), path=out, key="out", hint="Choose another, or pass --force.")
-    check_writable(out)
     return name
 
 

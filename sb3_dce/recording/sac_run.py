@@ -67,8 +67,9 @@ class SACRun:
     :param folder: where it lives
     :param settings: of the run
     :param progress: called with the steps done and the most there will be
-    :param note: called with one line per evaluation
+    :param note: called with one line when it begins to train or goes on, and one per evaluation
     :raises ConfigError: if the folder holds a run with other settings
+    :raises CheckpointError: if its ``state.json`` is damaged
     """
 
     def __init__(
@@ -151,6 +152,8 @@ class SACRun:
 
     def _train_until_next_evaluation(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
+        if self._model is None:
+            self.note(f"training SAC from step {self.steps:,} on, about an hour per 300,000 steps on one core")
         model = self._loaded_model()
         before = self.steps
         until = min(before + self.settings.eval_freq, self.settings.max_steps)
@@ -223,8 +226,11 @@ class SACRun:
             return
         try:
             state = json.loads(path.read_text(encoding="utf-8"))
-            begun = state.pop("config")
-        except (ValueError, KeyError) as error:
+            begun = dict(state.pop("config"))
+            ends = [until for until, _, _ in state["evaluations"]]
+            if not state.keys() >= self._state.keys() or state["steps"] != (ends or [0])[-1]:
+                raise ValueError("not the state of a run")
+        except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
             raise CheckpointError(
                 f"damaged ({error})", where=str(path), path=path, hint="Delete the folder; the run starts anew."
             ) from error
@@ -238,11 +244,15 @@ class SACRun:
         self._state = state
 
     def _rows(self) -> Arrays:
-        """All rows so far. Where the run was interrupted an episode ends without a terminal, as at a time limit."""
+        """
+        All rows so far. Where the run was interrupted an episode ends without a terminal, as at a time limit.
+
+        Parts end where evaluations were made; another one was left by a run that was killed, and then made longer.
+        """
         parts, start = [], 0
-        while start < self.steps:
-            path = next(self.folder.glob(f"replay/{start}-*.npz"), None)
-            if path is None:
+        for until, _, _ in self.evaluations:
+            path = self.folder / "replay" / f"{start}-{until}.npz"
+            if not path.is_file():
                 raise CheckpointError(
                     f"the replay buffer lacks the rows from {start:,} on",
                     where=str(self.folder),
@@ -250,7 +260,7 @@ class SACRun:
                     hint="Delete the folder; the run starts anew.",
                 )
             parts.append(arrays_from_npz(path))
-            start += len(parts[-1]["rewards"])
+            start = until
         arrays = concatenate(parts)
         arrays["timeouts"][self._state["cuts"]] = True
         return arrays

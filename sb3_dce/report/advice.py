@@ -196,5 +196,5 @@ def _compat(transitions: Transitions) -> tuple[str, str]:
             f"On: the rows are those of D4RL's qlearning_dataset, {info.dropped_rows:,} of the file are dropped.",
         )
     extra = info.n_timeouts if info.has_next_observations else 0
-    cost = f"would drop {extra:,} rows at time limits that are used now" if extra else "uses nearly the same rows here"
+    cost = f"would drop {extra:,} rows at most, at ends without a terminal" if extra else "uses nearly the same rows here"
     return "d4rl_compat", f"Only to compare with published D4RL tables: it {cost}."

@@ -96,9 +96,10 @@ def estimate_behaviour(transitions: Transitions, seed: int = 0) -> Behaviour | N
         return None
     half_squares = 0.5 * (actions[queries, None] - actions[neighbours]) ** 2  # (queries, neighbours, act_dim)
     pairs = half_squares, squared_distances, index[queries, None], index[neighbours]
+    variance, nearest = _at_distance_zero(half_squares, squared_distances)
     return Behaviour(
-        std=np.sqrt(_at_distance_zero(half_squares, squared_distances)),
-        nearest_std=np.sqrt(half_squares[:, 0].mean(axis=0)),
+        std=np.sqrt(variance),
+        nearest_std=np.sqrt(nearest),
         marginal_std=actions.std(axis=0),
         mix_by_position=_mix(*pairs, _position_groups(transitions)),
         mix_by_return=_mix(*pairs, _return_groups(transitions)),
@@ -164,15 +165,18 @@ def _smallest(values: np.ndarray, n: int) -> np.ndarray:
     return chosen
 
 
-def _at_distance_zero(half_squares: np.ndarray, squared_distances: np.ndarray) -> np.ndarray:
-    """Intercept of the line through the means of the k-th neighbours, between 0 and the mean of the nearest, (act_dim,)."""
+def _at_distance_zero(half_squares: np.ndarray, squared_distances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """
+    Intercept of the line through the means of the k-th neighbours, and the mean of the nearest, both of shape (act_dim,).
+
+    The intercept is kept between 0 and that mean: chance, or a line that does not fit, would put it outside.
+    """
     means, distances = half_squares.mean(axis=0), squared_distances.mean(axis=0)
     centred = distances - distances.mean()
     spread = float(centred @ centred)
-    if spread == 0.0:  # states repeat exactly: nothing to extrapolate
-        return means.mean(axis=0)
-    slopes = np.maximum(centred @ means / spread, 0.0)
-    return np.maximum(means.mean(axis=0) - slopes * distances.mean(), 0.0)
+    # states that repeat exactly leave nothing to extrapolate
+    slopes = np.maximum(centred @ means / spread, 0.0) if spread > 0.0 else 0.0
+    return np.clip(means.mean(axis=0) - slopes * distances.mean(), 0.0, means[0]), means[0]
 
 
 def _mix(

@@ -358,7 +358,7 @@ def _randomness(behaviour: Behaviour) -> Plot:
     axes = figure.add_subplot()
     axes.bar(entries - 0.2, behaviour.marginal_std, 0.4, color=_MAIN, alpha=0.35, label="over all states")
     axes.bar(entries + 0.2, behaviour.std, 0.4, color=_MAIN, label="given the state")
-    above = np.maximum(behaviour.nearest_std - behaviour.std, 0.0)
+    above = behaviour.nearest_std - behaviour.std
     axes.errorbar(entries + 0.2, behaviour.std, [np.zeros_like(above), above], fmt="none", ecolor=_ACCENT, linewidth=1.5)
     axes.set_ylim(0, 1.25 * float(max(behaviour.marginal_std.max(), behaviour.nearest_std.max(), 1e-3)))
     _integer_axis(axes)

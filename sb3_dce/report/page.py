@@ -180,7 +180,7 @@ def _source(transitions: Transitions) -> str:
     info = transitions.info
     lines = [f"Ends of episodes: {info.episode_rule}."]
     if info.path is not None:
-        lines = [f"File: {info.path}", f"SHA-256: {file_hash(info) or 'none, it is a folder'}", *lines]
+        lines = [f"File: {info.path}", f"SHA-256: {file_hash(info) or 'none, the file has gone'}", *lines]
     text = "\n".join(f"<p>{escape(line)}</p>" for line in lines)
     attributes = _attributes(info.path)
     if attributes:
