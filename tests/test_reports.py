@@ -16,6 +16,7 @@ from sb3_dce.experiments.captions import caption
 from sb3_dce.experiments.claims import claim_table, own_table_facts
 from sb3_dce.experiments.curves import panel_curves
 from sb3_dce.experiments.diagnosis import diagnostics_table, variant_table
+from sb3_dce.experiments.equal_steps import equal_steps_table
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.figures import draw, draw_profile
 from sb3_dce.experiments.grid import EMBEDDED, experiment_ids, load_experiment, variant_hash
@@ -195,6 +196,25 @@ def test_runs_of_another_length_that_diverged_are_counted() -> None:
     table = score_table(evidence_of(results.merge([table_rows(TABLE, {CHEETAH: others}, n_updates=50_000), short, *lost])))
     assert cell(table, CHEETAH, "ours: PBRL") == "91.0 ± 1.4 (after 10,000, 2 seeds, 1 diverged)"
     assert cell(table, CHEETAH, "ours: CQL") == "(1 diverged, after 10,000)"
+
+
+def test_agents_with_runs_of_several_lengths_have_a_table_of_scores_after_equally_many_steps() -> None:
+    def curve(agent: str, seed: int, n_updates: int, *course: float) -> pd.DataFrame:
+        return run_rows(TABLE, agent, CHEETAH, seed, curves={"score": course}, n_updates=n_updates)
+
+    runs = [curve("BC", seed, 50_000, 1.0, 2.0 + seed, 3.0, 4.0, 5.0) for seed in (0, 1)]
+    runs += [curve("DCE", 0, 50_000, 10.0, 20.0, 30.0, 40.0, 50.0), curve("PBRL", 0, 20_000, 6.0, 7.0)]
+    runs += [diverged("CQL", CHEETAH, 0, n_updates=50_000)]
+    table = equal_steps_table(evidence_of(results.merge(runs)))
+    assert table is not None
+    columns = ("steps", "BC", "PBRL", "CQL", "DCE", "IQL")
+    shown = [cell(table, CHEETAH, column) for column in columns]
+    assert shown == ["20,000", "2.5 ± 0.7 (2 seeds)", "7.0", "(1 diverged)", "20.0", "-"]
+    other = table_rows(TABLE, {"walker2d-medium-sb3": {"BC": [3.0], "DCE": [5.0], "PBRL": [8.0]}}, n_updates=20_000)
+    table = equal_steps_table(evidence_of(results.merge([*runs, other])))
+    assert table is not None
+    assert [cell(table, "total", column) for column in columns] == ["20,000", "5.5", "15.0", "-", "25.0", "-"]
+    assert equal_steps_table(evidence_of(other)) is None, "the table of scores compares them"
 
 
 def test_all_columns_of_the_long_table_are_over_the_same_seeds() -> None:

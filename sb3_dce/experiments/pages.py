@@ -21,6 +21,7 @@ HEADINGS = {
         for source, whose in (("D4RL", "D4RL's"), ("sb3", "our own"))
         for ending, where in (("", ""), ("-adroit", ": Adroit"), ("-kitchen", ": Kitchen"))
     },
+    "equal-steps": "After equally many steps",
     "run-times": "Run times",
     "bounds": "Bounds (Eq. 14 to 17)",
     "claim-4.3": "Claim 4.3 on a linear critic",

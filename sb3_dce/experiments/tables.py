@@ -111,7 +111,7 @@ def score_cell(evidence: Evidence, variant: Variant, dataset_id: str, best: Inte
     lost = f" ({diverged} diverged)" if diverged else ""
     if not len(scores):
         return lost.strip() or "-"
-    text = _mean_and_spread(scores)
+    text = mean_and_spread(scores)
     if best is not None and not diverged and len(scores) > 1 and mean_interval(scores).overlaps(best):
         text = f"**{text}**"
     if len(scores) != usual:
@@ -126,14 +126,20 @@ def _cell_of_other_length(rows: pd.DataFrame, usual: int) -> str:
     if not len(scores):
         return f"({', '.join([*lost, after])})" if lost else "-"
     number = [] if len(scores) == usual else [_seeds(scores)]
-    return f"{_mean_and_spread(scores)} ({', '.join([after, *number, *lost])})"
+    return f"{mean_and_spread(scores)} ({', '.join([after, *number, *lost])})"
 
 
 def _seeds(scores: np.ndarray) -> str:
     return f"{len(scores)} seed{'s' if len(scores) > 1 else ''}"
 
 
-def _mean_and_spread(scores: np.ndarray) -> str:
+def mean_and_spread(scores: np.ndarray) -> str:
+    """
+    A cell of scores.
+
+    :param scores: one per seed
+    :return: mean, and from two seeds on ± the sample standard deviation
+    """
     return f"{scores.mean():.1f}" + (f" ± {sample_std(scores):.1f}" if len(scores) > 1 else "")
 
 
@@ -172,7 +178,7 @@ def common_rows(evidence: Evidence, part: str) -> list[str]:
         have run on fewer than half of the data of the one with the most: a total over the little they have would say nothing
         about the others
     """
-    ids = _rows_of_part(evidence, part)
+    ids = rows_of_part(evidence, part)
     papers = [v for v in evidence.experiment.variants if v.paper is not None]
     counts = [sum(evidence.has_ended(v, name) for name in ids) for v in papers]
     variants = [v for v, count in zip(papers, counts, strict=True) if count and 2 * count >= max(counts)]
@@ -212,7 +218,14 @@ def n_diverged(evidence: Evidence, variant: Variant, ids: list[str]) -> int:
     return sum(evidence.n_diverged(variant, name) for name in ids)
 
 
-def _rows_of_part(evidence: Evidence, part: str) -> list[str]:
+def rows_of_part(evidence: Evidence, part: str) -> list[str]:
+    """
+    The data of a part that have runs.
+
+    :param evidence: rows
+    :param part: one of :func:`parts_of`
+    :return: ids, in the order of the grid
+    """
     source, _, family = part.partition("-")
     rows = [name for _, name in evidence.table_rows() if source_of(name) == source]
     return [name for name in rows if not family or resolve(name).family == family]

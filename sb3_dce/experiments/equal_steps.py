@@ -1,0 +1,75 @@
+"""Scores of all agents after equally many steps, where the slow ones have shorter runs than the others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+
+from sb3_dce.experiments.captions import caption
+from sb3_dce.experiments.evidence import Evidence, curve_of, n_diverged_in, of_seeds_that_ended
+from sb3_dce.experiments.tables import mean_and_spread, parts_of, rows_of_part
+from sb3_dce.experiments.text_table import TextTable
+
+NOTE = (
+    "The last number of steps at which every agent with runs on a set was evaluated. Longer runs are on their way there: what "
+    "an agent plans over a whole run (IQL the learning rate of its actor) is that of the longer one. No claim is judged by "
+    "these scores."
+)
+
+
+def equal_steps_table(evidence: Evidence) -> TextTable | None:
+    """
+    What the table of scores cannot compare, since a cell "after n" is of another length than its row.
+
+    :param evidence: of an experiment with a table
+    :return: one row per file on which two agents of the paper or more have runs, at the last step at which all of them were
+        evaluated; totals where that is the same on all data of a source; ``None`` if all runs have the length of their row
+    """
+    agents = [v for v in evidence.experiment.variants if v.paper is not None]
+    ids = [name for _, name in evidence.table_rows()]
+    if not any(len(evidence.of_other_length(v, name)) for name in ids for v in agents):
+        return None
+    rows: list[tuple[str, ...]] = []
+    scores: dict[str, tuple[int, dict[str, np.ndarray]]] = {}
+    for name in ids:
+        runs = {v.name: evidence.shown([name], [v]) for v in agents}
+        lost = {agent: n for agent, found in runs.items() if (n := n_diverged_in(found))}
+        curves = {agent: _curve(found) for agent, found in runs.items()}
+        after = _last_common_step(curves)
+        if after is None:
+            continue
+        at = {agent: curve.loc[after].to_numpy() for agent, curve in curves.items() if len(curve)}
+        rows.append((name, f"{after:,}", *(_cell(at.get(v.name), lost.get(v.name, 0)) for v in agents)))
+        scores[name] = after, {agent: found for agent, found in at.items() if agent not in lost}
+    for part in parts_of(evidence):
+        ids = [name for name in rows_of_part(evidence, part) if name in scores]
+        steps = {scores[name][0] for name in ids}
+        if len(ids) > 1 and len(steps) == 1:
+            sums = (_total([scores[name][1] for name in ids], v.name) for v in agents)
+            rows.append((f"total of these {len(ids)} ({part.replace('-', ', ')})", f"{steps.pop():,}", *sums))
+    header = ("data", "steps", *(v.name for v in agents))
+    return TextTable(header, tuple(rows), f"{NOTE} {caption(evidence, scores, agents)}")
+
+
+def _curve(rows: pd.DataFrame) -> pd.DataFrame:
+    """Scores of the seeds that did not diverge, empty without any."""
+    return of_seeds_that_ended(curve_of(rows, "score"), int(rows["n_updates"].iloc[0])) if len(rows) else pd.DataFrame()
+
+
+def _last_common_step(curves: Mapping[str, pd.DataFrame]) -> int | None:
+    steps = [set(curve.dropna().index) for curve in curves.values() if len(curve)]
+    common = set.intersection(*steps) if len(steps) > 1 else set()
+    return int(max(common)) if common else None
+
+
+def _cell(scores: np.ndarray | None, n_diverged: int) -> str:
+    notes = [] if scores is None or len(scores) < 2 else [f"{len(scores)} seeds"]
+    notes += [f"{n_diverged} diverged"] if n_diverged else []
+    text = "" if scores is None else mean_and_spread(scores)
+    return f"{text} ({', '.join(notes)})".strip() if notes else text or "-"
+
+
+def _total(rows: list[dict[str, np.ndarray]], agent: str) -> str:
+    return f"{sum(float(of[agent].mean()) for of in rows):.1f}" if all(agent in of for of in rows) else "-"
