@@ -16,6 +16,7 @@ from rich.console import Console
 from sb3_dce import cli_datasets
 from sb3_dce.checks import LAST_SEED, SEEDS_PER_EVALUATION, check_steps
 from sb3_dce.cli_datasets import DatasetArgument
+from sb3_dce.cli_recording import importable_here
 from sb3_dce.errors import ConfigError, SB3DCEError
 from sb3_dce.messages import show_warnings_as_lines
 from sb3_dce.processes import Terminated, usable_cores
@@ -237,7 +238,12 @@ def evaluate(
     episodes: Annotated[int, typer.Option(min=1, max=SEEDS_PER_EVALUATION, help="Episodes.")] = 10,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first episode.")] = 0,
     env: Annotated[
-        str | None, typer.Option(show_default=False, help="Id of an environment, for models of data that have none.")
+        str | None,
+        typer.Option(
+            callback=importable_here,
+            show_default=False,
+            help="Id of an environment, or module:EnvId, for models of data that have none.",
+        ),
     ] = None,
 ) -> None:
     """Run a trained agent in its environment: returns, lengths, normalised score."""

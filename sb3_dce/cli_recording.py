@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,6 +31,18 @@ VecNormalizeOption = Annotated[
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace an existing file; drop an interrupted recording of it.")]
 
 
+def importable_here(env: str | None) -> str | None:
+    """
+    ``my_module:MyEnv-v0`` is, as a rule, a module in the folder that the user is in, which an installed command does not see.
+
+    :param env: id of an environment, with the module that registers it before a colon
+    :return: the same
+    """
+    if env is not None and ":" in env and os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
+    return env
+
+
 def record_dataset(
     policy: Annotated[
         str,
@@ -39,7 +53,11 @@ def record_dataset(
         ),
     ],
     env: Annotated[
-        str, typer.Option(help="Environment id such as HalfCheetah-v4, or a dataset id, which stands for its environment.")
+        str,
+        typer.Option(
+            callback=importable_here,
+            help="Environment id such as HalfCheetah-v4, or module:EnvId, or a dataset id, which stands for its environment.",
+        ),
     ],
     steps: Annotated[
         int | None, typer.Option(min=1, show_default=False, help="Rows; the last episode is cut. Default 1000000.")

@@ -284,6 +284,24 @@ def test_an_environment_can_be_named_for_an_evaluation(tmp_path: Path) -> None:
     assert both.code == 2 and "both name an environment" in both.stderr
 
 
+def test_module_of_an_environment_is_found_in_the_users_folder(tmp_path: Path) -> None:
+    OfflineBC.load_dataset(TINY, seed=0, policy_kwargs={"net_arch": [8]}).save(tmp_path / "model.zip")
+    entry = "gymnasium.envs.mujoco.half_cheetah_v4:HalfCheetahEnv"
+    code = f"import gymnasium\ngymnasium.register('MyEnv-v0', '{entry}', max_episode_steps=20)\n"
+    (tmp_path / "my_module.py").write_text(code)
+    command = [
+        Path(sys.executable).with_name("sb3-dce"),
+        "evaluate",
+        "model.zip",
+        "--env",
+        "my_module:MyEnv-v0",
+        "--episodes",
+        "1",
+    ]
+    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert run.returncode == 0 and "length    20" in run.stdout, run.stderr
+
+
 @pytest.mark.parametrize("algo", agents.AGENTS)
 def test_every_agent_goes_through_load_dataset_and_a_run_that_is_loaded(algo: str, tmp_path: Path) -> None:
     few = {"offline_uwac": {"n_mc_dropout": 2, "n_target_actions": 2}, "offline_pbrl": {"n_ood_actions": 1}}
