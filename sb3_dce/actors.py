@@ -74,7 +74,7 @@ class GaussianActor(KeepDtype, BasePolicy):
         :return: mean in (-1, 1), shape (batch, action_dim), and log standard deviation, shape (action_dim,)
         """
         features = self.extract_features(obs, self.features_extractor)
-        latent = self.latent_pi(features) if masks is None else masked_mlp(self.latent_pi, features, masks, self.activation_fn)
+        latent = self.latent_pi(features) if masks is None else masked_mlp(self.latent_pi, features, masks)
         return th.tanh(self.mu(latent)), self.log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
 
     def forward(self, obs: th.Tensor, deterministic: bool = False) -> th.Tensor:

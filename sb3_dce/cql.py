@@ -47,8 +47,10 @@ class OfflineCQL(ActorLearningRate, ActorWarmUp, EntropyCoefficient, OfflineAlgo
 
     The sum over actions is estimated from uniform actions, actions of the policy at s and actions of the policy at s' (all
     valued at s), each divided by its density. All hidden layers have 256 units, three per network. The target has no
-    entropy term. Differences from the authors' code: none in the formulas; one Adam over both critics, which is the same
-    as one each; targets start as copies of the critics, with PyTorch's first weights.
+    entropy term. Differences from the authors' code: none in the formulas of the critics; the actor is that of
+    Stable-Baselines3, whose log standard deviation goes down to -20 (theirs to -5); the first phase takes one update more,
+    bounds no mean (theirs: 9) and clips the data's actions 1e-5 inside of their bounds; one Adam over both critics, which is
+    the same as one each; targets start as copies of the critics, with PyTorch's first weights.
 
     Parameters not listed here are described in :class:`~sb3_dce.base.OfflineAlgorithm`.
 
@@ -304,6 +306,7 @@ def update(
     new["actor"], loss, _, norm = descend(pi_loss, state["actor"], rate, settings["actor"], clip)
     metrics.update(actor_loss=loss, grad_norm_actor=norm, entropy=-log_prob.mean(), ent_coef=ent_coef.mean())
     metrics.update(bc_loss=losses.bc_nll(mean, log_std, a), **action_metrics(a_pi, a))
+    metrics["actor_learning_rate"] = rate
 
     # 6 targets
     new["critic_target"] = polyak(new["critic"].params, state["critic_target"], coef["tau"])

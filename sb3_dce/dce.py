@@ -345,10 +345,12 @@ class OfflineDCE(EntropyCoefficient, OfflineAlgorithm):
         n, extra = self._n_updates, {"epoch": self._n_updates / self.steps_per_epoch}
         if self.penalty_form != "linear":  # another form does not lower Q on the data by beta_eff at each step
             return extra
-        # Q is linear in beta: every change of beta shifts it as if it had been there alone
-        changes = self._beta_schedule().changes(n)
-        factors = [(shift_factor(n - at, self.gamma, self.tau), by) for at, by in changes]
-        extra["beta_pred_shift"] = sum(factor * beta_eff(by, self.td_loss_coef) for factor, by in factors)
+        # what the closed form assumes: V itself is bootstrapped on, and nothing else than the penalty moves Q off its target
+        if self.use_v and not self.use_target_v and self.penalty_floor is None and not self.critic_weight_decay:
+            # Q is linear in beta: every change of beta shifts it as if it had been there alone
+            changes = self._beta_schedule().changes(n)
+            factors = [(shift_factor(n - at, self.gamma, self.tau), by) for at, by in changes]
+            extra["beta_pred_shift"] = sum(factor * beta_eff(by, self.td_loss_coef) for factor, by in factors)
         if self.dataset_statistics is not None:
             extra["survival_margin"] = self._mean_reward() - means["beta_eff"]
         return extra

@@ -54,7 +54,7 @@ class Evaluation:
         return None if self.dataset_id is None else float(normalized_score(self.dataset_id, self.mean))
 
 
-def evaluate(model: Any, rollouts: Rollouts, seed: int, dataset_id: str | None = None) -> Evaluation:
+def evaluate(model: Any, rollouts: Rollouts, seed: int = 0, dataset_id: str | None = None) -> Evaluation:
     """
     Deterministic episodes with fixed seeds: the returns of ``evaluate_policy`` on a ``DummyVecEnv`` with as many environments
     as ``rollouts``, by default one per episode, seeded with ``seed``.

@@ -40,20 +40,19 @@ class KeepDtype:
         return next(self.parameters()).dtype  # type: ignore[attr-defined]
 
 
-def masked_mlp(net: nn.Module, hidden: th.Tensor, masks: Sequence[th.Tensor], activation_fn: type[nn.Module]) -> th.Tensor:
+def masked_mlp(net: nn.Module, hidden: th.Tensor, masks: Sequence[th.Tensor]) -> th.Tensor:
     """
     Run a sequence of layers with dropout after each activation.
 
-    :param net: layers
+    :param net: linear layers, with an activation and perhaps a normalisation after each hidden one
     :param hidden: inputs, shape (batch, width)
     :param masks: per activation a factor of shape (batch, width): 0, or 1 / (1 - dropout)
-    :param activation_fn: class of the activations
     :return: outputs of the last layer
     """
     remaining = iter(masks)
     for layer in net.children():
         hidden = layer(hidden)
-        if isinstance(layer, activation_fn):
+        if not isinstance(layer, nn.Linear | nn.LayerNorm):  # an activation may be made by a function, which is no class
             hidden = hidden * next(remaining)
     return hidden
 
@@ -110,7 +109,6 @@ class OfflineCritic(KeepDtype, ContinuousCritic):
             n_critics,
             share_features_extractor,
         )
-        self.activation_fn = activation_fn
         if layer_norm:
             self.q_networks = []
             for index in range(n_critics):
@@ -141,10 +139,7 @@ class OfflineCritic(KeepDtype, ContinuousCritic):
         inputs = th.cat([features, actions], dim=-1)
         if masks is None:
             return tuple(q_net(inputs) for q_net in self.q_networks)
-        return tuple(
-            masked_mlp(q_net, inputs, net_masks, self.activation_fn)
-            for q_net, net_masks in zip(self.q_networks, masks, strict=True)
-        )
+        return tuple(masked_mlp(q_net, inputs, net_masks) for q_net, net_masks in zip(self.q_networks, masks, strict=True))
 
 
 class ValueNet(KeepDtype, BaseModel):

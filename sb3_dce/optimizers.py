@@ -61,6 +61,9 @@ class AdamSettings:
                 key="optimizer_class",
                 hint='Choose one of the two in policy_kwargs={"optimizer_class": ...}.',
             )
+        if len(optimizer.param_groups) != 1:
+            what = f"{len(optimizer.param_groups)} groups of parameters, which would need constants of their own"
+            raise ConfigError(f"the optimizer has {what}", key="optimizer_class", hint="Give it all parameters as one group.")
         group = optimizer.param_groups[0]
         for option in ("amsgrad", "maximize"):
             if group.get(option):
@@ -72,7 +75,7 @@ class AdamSettings:
             beta2=group["betas"][1],
             eps=group["eps"],
             weight_decay=group["weight_decay"],
-            decoupled=isinstance(optimizer, th.optim.AdamW),
+            decoupled=group.get("decoupled_weight_decay", isinstance(optimizer, th.optim.AdamW)),
             trained=trained,
         )
 
@@ -95,10 +98,9 @@ def adam_step(learner: Learner, gradient: th.Tensor, learning_rate: th.Tensor, s
     step = learner.step + 1.0
     exp_avg = th.lerp(learner.exp_avg, gradient, 1.0 - settings.beta1)
     exp_avg_sq = settings.beta2 * learner.exp_avg_sq + (1.0 - settings.beta2) * gradient.square()
-    # expm1, since 1 - beta2^step loses half its digits in float32 at the start.
     n = step.to(params.dtype)
-    step_size = learning_rate / -th.expm1(n * math.log(settings.beta1))
-    root_correction = (-th.expm1(n * math.log(settings.beta2))).sqrt()
+    step_size = learning_rate / _bias_correction(settings.beta1, n)
+    root_correction = _bias_correction(settings.beta2, n).sqrt()
     # Stacked, since on a processor a stack is computed once: the compiler would otherwise take both again for every few
     # parameters. On a GPU it may, which is why this is not done in float64.
     step_size, root_correction = th.stack([step_size, root_correction]).unbind()
@@ -106,3 +108,8 @@ def adam_step(learner: Learner, gradient: th.Tensor, learning_rate: th.Tensor, s
     if settings.trained is not None:
         params = th.where(settings.trained, params, learner.params)  # not even by weight decay or what the moments remember
     return Learner(params, exp_avg, exp_avg_sq, step)
+
+
+def _bias_correction(beta: float, step: th.Tensor) -> th.Tensor:
+    """``1 - beta^step``, by expm1, since in float32 it loses half its digits at the start otherwise."""
+    return -th.expm1(step * math.log(beta)) if beta > 0.0 else th.ones_like(step)

@@ -44,7 +44,8 @@ class OfflinePBRL(ActorLearningRate, EntropyCoefficient, OODWeight, OfflineAlgor
 
     Differences from the authors' code: one Adam over all critics, which is the same as one each; online and target critics
     share their random priors (the code draws them anew for the targets), and the actor's gradient passes through them; targets
-    start as copies of the critics, with PyTorch's first weights.
+    start as copies of the critics, with PyTorch's first weights; the actor's log standard deviation goes down to -20, as in
+    Stable-Baselines3 (theirs to -5).
 
     Parameters not listed here are described in :class:`~sb3_dce.base.OfflineAlgorithm`.
 
@@ -300,6 +301,7 @@ def update(
     new["actor"], loss, _, norm = descend(pi_loss, state["actor"], rate, settings["actor"], clip)
     metrics.update(actor_loss=loss, grad_norm_actor=norm, entropy=-log_prob.mean(), ent_coef=ent_coef.mean())
     metrics.update(action_metrics(a_pi, a))
+    metrics["actor_learning_rate"] = rate
 
     # 5 targets
     new["critic_target"] = polyak(new["critic"].params, state["critic_target"], coef["tau"])

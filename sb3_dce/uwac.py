@@ -57,7 +57,8 @@ class OfflineUWAC(ActorLearningRate, ActorWarmUp, OfflineAlgorithm):
     Differences from the authors' code: dropout masks of a pass are shared by the states of a batch (see
     :meth:`~sb3_dce.uwac_networks.DropoutCritic.mc_values`; a state's own means, variances and maxima are distributed as
     there); targets start as copies of the critics instead of drawn anew; one Adam over both critics, which is the same as
-    one each; PyTorch's first weights. Episodes end where the data say so, not after 999 rows.
+    one each; PyTorch's first weights; the actor's log standard deviation goes down to -20, as in Stable-Baselines3 (theirs to
+    -5). Episodes end where the data say so, not after 999 rows.
 
     Names: alpha is the multiplier of the MMD, not an entropy coefficient; ``uwac_beta`` is not DCE's beta. Parameters not
     listed here are described in :class:`~sb3_dce.base.OfflineAlgorithm`.
@@ -355,6 +356,7 @@ def update(
     new["actor"], loss, (mmd, a_pi, log_prob, *q_kept), norm = descend(pi_loss, state["actor"], rate, settings["actor"], clip)
     metrics.update(actor_loss=loss, grad_norm_actor=norm, mmd=mmd.mean(), alpha=alpha.mean(), entropy=-log_prob.mean())
     metrics.update(action_metrics(a_pi, a))
+    metrics["actor_learning_rate"] = rate
     if not mmd_only:
         q_pi, variances = q_kept
         metrics.update(q_policy=q_pi, q_gap=q_pi - q_data.mean(), policy_variance=variances.mean())

@@ -44,11 +44,12 @@ CRITIC_METRICS = (
     "beta_eff penalty gap_td beta_pred_shift survival_margin ent_coef ent_coef_loss entropy action_sat twin_gap "
     "grad_norm_q epoch"
 )
+WITHOUT_V = CRITIC_METRICS.replace("beta_pred_shift ", "")
 VALUE_METRICS = "value value_loss adv adv_pos_frac grad_norm_v"
 Q_METRICS = "q_data q_data_std q_data_min q_data_max value_next td_target td_mse critic_loss grad_norm_q"
 AGENTS = {
     "DCE": Agent(OfflineDCE, {}, f"{CRITIC_METRICS} {VALUE_METRICS}"),
-    "DCE-without-V": Agent(OfflineDCE, {"use_v": False, "td_loss_coef": 0.5, "beta": 1.0}, CRITIC_METRICS),
+    "DCE-without-V": Agent(OfflineDCE, {"use_v": False, "td_loss_coef": 0.5, "beta": 1.0}, WITHOUT_V),
     "BC": Agent(OfflineBC, {}, "bc_loss"),
     "BC-likelihood": Agent(OfflineBC, {"bc_loss": "nll"}, "bc_loss"),
     "TD3BC": Agent(OfflineTD3BC, {}, f"{Q_METRICS} q_policy q_gap action_sat bc_loss lambda"),
@@ -60,12 +61,12 @@ AGENTS = {
     ),
     "SAC": Agent(OfflineSAC, {}, f"{Q_METRICS} q_policy q_gap ent_coef ent_coef_loss entropy action_sat"),
     "SAC-V": Agent(OfflineSACV, {}, f"{CRITIC_METRICS} {VALUE_METRICS}"),
-    "CQL-Eq18": Agent(OfflineCQLEq18, {"beta": 1.0}, CRITIC_METRICS.replace("ent_coef_loss", "")),
+    "CQL-Eq18": Agent(OfflineCQLEq18, {"beta": 1.0}, WITHOUT_V.replace("ent_coef_loss", "")),
     "CQL": Agent(
         OfflineCQL,
         {"n_actions": 2, "policy_eval_start": 3, "lagrange_threshold": 1.0, "actor_learning_rate": None},
         f"{Q_METRICS} q0_data q1_data q_policy q_next_policy q_uniform q_gap twin_gap cql_gap cql_penalty lagrange ent_coef "
-        "ent_coef_loss entropy action_sat bc_loss",
+        "ent_coef_loss entropy action_sat bc_loss actor_learning_rate",
     ),
     "PBRL": Agent(
         OfflinePBRL,
@@ -74,7 +75,7 @@ AGENTS = {
             **{"adaptive_ood_weight": True, "ood_weight_steps": 4},
         },
         f"{Q_METRICS} q_policy q_next_policy q_gap uncertainty_data uncertainty_policy uncertainty_next ood_loss ood_weight "
-        "ent_coef ent_coef_loss entropy action_sat",
+        "ent_coef ent_coef_loss entropy action_sat actor_learning_rate",
     ),
     "UWAC": Agent(
         OfflineUWAC,
@@ -83,7 +84,7 @@ AGENTS = {
             **{"policy_eval_start": 2, "actor_learning_rate": None},
         },
         f"{Q_METRICS} twin_gap vae_loss vae_mse vae_kl grad_norm_vae target_variance weight weight_min mmd alpha entropy "
-        "action_sat q_policy q_gap policy_variance policy_weight",
+        "action_sat q_policy q_gap policy_variance policy_weight actor_learning_rate",
     ),
 }
 

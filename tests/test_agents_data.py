@@ -138,6 +138,13 @@ def test_unsupported_policy_arguments_are_refused(
         make(agent, dataset=transitions, policy_kwargs=policy_kwargs, normalize_obs=False).learn(1)
 
 
+def test_optimizer_with_constants_for_each_group_of_parameters_is_refused(transitions: Transitions) -> None:
+    model = make(AGENTS["DCE"], dataset=transitions)
+    model.policy.critic.optimizer.add_param_group({"params": [th.nn.Parameter(th.zeros(1))], "weight_decay": 0.1})
+    with pytest.raises(ConfigError, match="2 groups of parameters"):
+        model.learn(1)
+
+
 @pytest.mark.parametrize("name", ["CnnPolicy", "MultiInputPolicy", "MlpPolice"])
 def test_other_policies_are_refused(agent: Agent, transitions: Transitions, name: str) -> None:
     with pytest.raises(ConfigError, match="MlpPolicy"):

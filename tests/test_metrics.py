@@ -161,6 +161,16 @@ def test_what_holds_for_the_linear_penalty_is_not_said_of_others(form: str, tran
     assert not {"beta_pred_shift", "survival_margin"} & set(model.read_metrics())
 
 
+@pytest.mark.parametrize(
+    "settings", [{"use_v": False}, {"use_target_v": True}, {"penalty_floor": 0.0}, {"critic_weight_decay": 1e-4}], ids=str
+)
+def test_expected_shift_is_not_said_where_its_closed_form_does_not_hold(
+    settings: dict[str, Any], transitions: Transitions
+) -> None:
+    metrics = dce(transitions, beta=0.1, **settings).learn(1, log_interval=None).read_metrics()
+    assert "beta_pred_shift" not in metrics and "survival_margin" in metrics
+
+
 def test_expected_shift_and_epoch_are_logged(transitions: Transitions) -> None:
     model = dce(transitions, beta=4.0, steps_per_epoch=10)
     model.learn(2, log_interval=None)

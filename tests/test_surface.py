@@ -289,16 +289,8 @@ def test_module_of_an_environment_is_found_in_the_users_folder(tmp_path: Path) -
     entry = "gymnasium.envs.mujoco.half_cheetah_v4:HalfCheetahEnv"
     code = f"import gymnasium\ngymnasium.register('MyEnv-v0', '{entry}', max_episode_steps=20)\n"
     (tmp_path / "my_module.py").write_text(code)
-    command = [
-        Path(sys.executable).with_name("sb3-dce"),
-        "evaluate",
-        "model.zip",
-        "--env",
-        "my_module:MyEnv-v0",
-        "--episodes",
-        "1",
-    ]
-    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    arguments = "evaluate model.zip --env my_module:MyEnv-v0 --episodes 1".split()
+    run = subprocess.run([Path(sys.executable).with_name("sb3-dce"), *arguments], cwd=tmp_path, capture_output=True, text=True)
     assert run.returncode == 0 and "length    20" in run.stdout, run.stderr
 
 
@@ -492,6 +484,10 @@ def test_examples_run_as_they_are_written(page: str, code: str, tmp_path: Path, 
     code = re.sub(r"learn\(1e\d", "learn(4", code).replace("train(1000)", "train(4)")
     code = re.sub(r'"(walker2d-medium|halfcheetah-demo-sb3)"', f'"{TINY}"', code)
     exec(compile(code, page, "exec"), {})
+
+
+def test_examples_are_found_on_the_pages() -> None:
+    assert {"README.md", "evaluation.md"} <= {page for page, _ in _examples()}
 
 
 def test_every_agent_is_in_the_battery() -> None:

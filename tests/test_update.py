@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import itertools
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pytest
@@ -106,7 +107,7 @@ class PlainDCE:
             n_hidden = 0
             for layer in q_net:
                 x = layer(x)
-                if isinstance(layer, nn.ReLU):
+                if isinstance(layer, nn.ReLU | nn.LeakyReLU):
                     if masks is not None:
                         x = x * masks[i][n_hidden]
                     n_hidden += 1
@@ -279,12 +280,15 @@ CASES: dict[str, dict[str, Any]] = {
     "cql": {"penalty_form": "cql", "n_penalty_actions": 2},
     "logsumexp": {"penalty_form": "logsumexp", "n_penalty_actions": 3, "penalty_action_source": "uniform"},
     "dropout": {"critic_dropout": 0.5, "n_penalty_actions": 2},
+    "dropout_of_made_activations": {"critic_dropout": 0.5, "policy_kwargs": {"activation_fn": partial(nn.LeakyReLU, 0.2)}},
     "dropout_in_target": {"critic_dropout": 0.5, "dropout_in_target": True},
     "layer_norm": {"critic_layer_norm": True},
     "critic_weight_decay": {"critic_weight_decay": 0.1},
     "max_grad_norm": {"max_grad_norm": 0.1},
     "adamw": {"policy_kwargs": {"optimizer_class": th.optim.AdamW, "optimizer_kwargs": {"weight_decay": 0.1}}},
     "adam_with_l2": {"policy_kwargs": {"optimizer_kwargs": {"weight_decay": 0.1, "betas": (0.8, 0.9), "eps": 1e-5}}},
+    "adam_decoupled": {"policy_kwargs": {"optimizer_kwargs": {"weight_decay": 0.1, "decoupled_weight_decay": True}}},
+    "adam_without_memory": {"policy_kwargs": {"optimizer_kwargs": {"betas": (0.0, 0.0), "eps": 1e-3}}},
     "actor_every_second_step": {"policy_update_freq": 2},
     "target_v": {"use_target_v": True},
     "reward_transformed": {"reward_scale": 0.5, "reward_shift": -0.25},
@@ -328,6 +332,15 @@ def test_compiled_update_equals_the_eager_one(transitions: Transitions) -> None:
     assert len(compiled._engine._compiled) == 1, "a changed beta is no reason to compile again"
     # 2, 1.75, 1.5, 1.25, 1: ten updates each
     assert metrics["beta"] == pytest.approx(1.5, abs=1e-12)
+
+
+@pytest.mark.slow
+@needs_compiler
+@pytest.mark.parametrize("case", ["without_v", "dropout"])
+def test_other_graphs_are_compiled_too(case: str, transitions: Transitions) -> None:
+    """That of CQL-Eq18 is the one without V."""
+    settings = {**CASES[case], "policy_kwargs": {"net_arch": [8]}}
+    check_compiled_equals_eager(lambda **kwargs: make_model(transitions, **settings, **kwargs))
 
 
 def test_update_changes_nothing_in_place(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,27 +10,36 @@ import pandas as pd
 from sb3_dce.experiments.evidence import Evidence, runs_in, span
 from sb3_dce.experiments.grid import Scale, Variant, source_of
 
+LAST_POLICY = "last policy"
 
-def caption(evidence: Evidence, dataset_ids: Iterable[str], variants: Iterable[Variant] | None = None) -> str:
+
+def caption(
+    evidence: Evidence,
+    dataset_ids: Iterable[str],
+    variants: Iterable[Variant] | None = None,
+    policy: str = LAST_POLICY,
+) -> str:
     """
     Origin of the numbers in a table or figure, for the runs that stand there for these data and agents.
 
     :param evidence: rows
     :param dataset_ids: data shown
     :param variants: agents shown; ``None`` for all
+    :param policy: which policy of a run the numbers are of
     :return: as :func:`caption_of`, of their runs
     """
     agents = list(evidence.experiment.variants if variants is None else variants)
-    return caption_of(evidence, evidence.shown(dict.fromkeys(dataset_ids), agents), agents)
+    return caption_of(evidence, evidence.shown(dict.fromkeys(dataset_ids), agents), agents, policy)
 
 
-def caption_of(evidence: Evidence, rows: pd.DataFrame, variants: list[Variant]) -> str:
+def caption_of(evidence: Evidence, rows: pd.DataFrame, variants: list[Variant], policy: str = LAST_POLICY) -> str:
     """
     Origin of the numbers in words: files and hashes, gradient steps, seeds, episodes, code, settings, further runs.
 
     :param evidence: rows of an experiment
     :param rows: of these, of the runs shown
     :param variants: agents shown
+    :param policy: which policy of a run the numbers are of
     :return: one paragraph, "No data." without rows; at smoke scale it begins with a warning
     """
     if rows.empty:
@@ -40,7 +49,7 @@ def caption_of(evidence: Evidence, rows: pd.DataFrame, variants: list[Variant]) 
     counts = sorted(runs.groupby(alike, observed=True).size().unique())
     episodes = sorted(rows[rows["metric"] == "n_episodes"]["value"].astype(int).unique())
     embedded = evidence.scale.source == "embedded"
-    protocol = f"Gradient steps: {span(sorted(runs['n_updates'].unique()))}; seeds: {span(counts)}; last policy"
+    protocol = f"Gradient steps: {span(sorted(runs['n_updates'].unique()))}; seeds: {span(counts)}; {policy}"
     protocol += f", {span(episodes)} episode{'' if episodes[-1] == 1 else 's'}" if episodes else ""
     parts = ["Smoke scale, a test of the machinery: numbers and verdicts say nothing about the agents."] if embedded else []
     parts += [f"Data (sha256): {_data(rows)}.", f"{protocol}.", f"Code: {_versions(rows['code_version'].unique())}."]

@@ -13,9 +13,9 @@ from sb3_dce.experiments.tables import mean_and_spread, parts_of, rows_of_part
 from sb3_dce.experiments.text_table import TextTable
 
 NOTE = (
-    "The last number of steps at which every agent with runs on a set was evaluated. Longer runs are on their way there: what "
-    "an agent plans over a whole run (IQL the learning rate of its actor) is that of the longer one. No claim is judged by "
-    "these scores."
+    "The last number of steps after which every agent with runs on a set was evaluated. Longer runs are on their way there: "
+    "what an agent plans over a whole run (IQL the learning rate of its actor) is that of the longer one. No claim is judged "
+    "by these scores."
 )
 
 
@@ -50,7 +50,7 @@ def equal_steps_table(evidence: Evidence) -> TextTable | None:
             sums = (_total([scores[name][1] for name in ids], v.name) for v in agents)
             rows.append((f"total of these {len(ids)} ({part.replace('-', ', ')})", f"{steps.pop():,}", *sums))
     header = ("data", "steps", *(v.name for v in agents))
-    return TextTable(header, tuple(rows), f"{NOTE} {caption(evidence, scores, agents)}")
+    return TextTable(header, tuple(rows), f"{NOTE} {caption(evidence, scores, agents, 'the policy at the step of the row')}")
 
 
 def _curve(rows: pd.DataFrame) -> pd.DataFrame:
