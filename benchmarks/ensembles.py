@@ -4,8 +4,9 @@ Critics of an ensemble one after the other or as batched matrix products: millis
     python benchmarks/ensembles.py                 # CQL's and PBRL's sizes on one core, about five minutes
     python benchmarks/ensembles.py --device cuda
 
-The ways take turns in one process. Writes ``results/ensembles.json`` and ``results/ensembles.md`` beside this file and prints
-the latter. :func:`sb3_dce.ensembles.batched_products_pay` follows these figures.
+The ways take turns in one process. Writes ``results/ensembles.json`` and ``results/ensembles.md`` beside this file
+(``ensembles-cuda`` on a CUDA device) and prints the latter. :func:`sb3_dce.ensembles.batched_products_pay` follows these
+figures.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import json
 import statistics
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch as th
@@ -78,12 +80,12 @@ def measure(ways: dict[str, Callable[[], object]], repeats: int, device: th.devi
     for _ in range(repeats):
         for name, way in ways.items():
             if cuda:
-                th.cuda.synchronize()
+                th.cuda.synchronize(device)
             started = clock()
             for _ in range(4):
                 way()
             if cuda:
-                th.cuda.synchronize()
+                th.cuda.synchronize(device)
             times[name].append(1000 * (clock() - started) / 4)
     return times
 
@@ -93,16 +95,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--out", type=Path, default=None, help="files without ending; default: by the device")
     options = parser.parse_args()
     th.set_num_threads(1)
     device = th.device(options.device)
-    facts = {**machine(), "device": options.device, "date": time.strftime("%Y-%m-%d")}
+    on_cuda = device.type == "cuda"
+    name = th.cuda.get_device_name(device) if on_cuda else "cpu"
+    facts = {**machine(), "device": name, "date": time.strftime("%Y-%m-%d")}
     times = {name: measure(make_ways(*size, device), options.repeats, device) for name, size in SIZES.items()}
     ways = list(next(iter(times.values())))
     lines = [
         "# Critics of an ensemble, one by one or batched",
         "",
-        f"{facts['processor']}, device {options.device}, one thread, PyTorch {facts['torch']}, {facts['date']}. Three hidden "
+        f"{facts['processor']}, device {facts['device']}, one thread, PyTorch {facts['torch']}, {facts['date']}. Three hidden "
         f"layers of 256, float32; milliseconds of forward and backward, medians of {options.repeats} (least).",
         "",
         f"| | critics | rows | {' | '.join(ways)} |",
@@ -112,9 +117,11 @@ def main() -> None:
         cells = [f"{statistics.median(times[name][way]):.1f} ({min(times[name][way]):.1f})" for way in ways]
         lines.append(f"| {name} | {size[0]} | {size[1]} | {' | '.join(cells)} |")
     text = "\n".join(lines) + "\n"
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "ensembles.json").write_text(json.dumps({"facts": facts, "milliseconds": times}, indent=1) + "\n")
-    (RESULTS / "ensembles.md").write_text(text)
+    out = options.out or RESULTS / ("ensembles-cuda" if on_cuda else "ensembles")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    document = json.dumps({"facts": facts, "milliseconds": times}, indent=1)
+    out.with_suffix(".json").write_text(document + "\n", encoding="utf-8")
+    out.with_suffix(".md").write_text(text, encoding="utf-8")
     print(text)
 
 

@@ -25,23 +25,27 @@ from sb3_dce import OfflineDCE, Transitions
 from sb3_dce.population import Population
 
 
-def updates_per_second(train: Callable[[int], None], seconds: float) -> list[float]:
+def updates_per_second(train: Callable[[int], None], device: th.device, seconds: float) -> list[float]:
     """
     :param train: runs so many updates
+    :param device: where they run
     :param seconds: about how long each of three repeats lasts
     :return: updates per second of each
     """
-    train(30)  # compiling, capturing, tuning
-    th.cuda.synchronize()
+
+    def run(n: int) -> None:
+        train(n)
+        if device.type == "cuda":
+            th.cuda.synchronize(device)
+
+    run(30)  # compiling, capturing, tuning
     started = time.perf_counter()
-    train(30)
-    th.cuda.synchronize()
+    run(30)
     n = max(30, round(30 * seconds / (time.perf_counter() - started)))
     rates = []
     for _ in range(3):
         started = time.perf_counter()
-        train(n)
-        th.cuda.synchronize()
+        run(n)
         rates.append(n / (time.perf_counter() - started))
     return rates
 
@@ -55,20 +59,23 @@ def main() -> None:
     parser.add_argument("--device", default="cuda", help="only to try the script: 'cpu' says nothing")
     parser.add_argument("--out", type=Path, default=RESULTS / "gpu")
     options = parser.parse_args()
-    if options.device == "cuda" and not th.cuda.is_available():
+    device = th.device(options.device)
+    if device.type == "cuda" and not th.cuda.is_available():
         sys.exit("This measures a CUDA device, and PyTorch finds none.")
-    if options.device == "cpu":
-        th.cuda.synchronize = lambda: None  # type: ignore[assignment]
 
-    device = th.cuda.get_device_name() if options.device == "cuda" else "cpu"
-    facts = {**machine(), "device": device, "date": time.strftime("%Y-%m-%d"), "rows": options.rows}
+    name_of_device = th.cuda.get_device_name(device) if device.type == "cuda" else "cpu"
+    facts = {**machine(), "device": name_of_device, "date": time.strftime("%Y-%m-%d"), "rows": options.rows, "run as": {}}
     transitions = Transitions.from_arrays(**make_arrays(options.rows))
     common: dict[str, Any] = {"env": make_env(), "dataset": transitions, "batch_size": BATCH, "seed": 0}
     results: dict[str, list[float]] = {}
 
-    def measured(name: str, train: Callable[[int], None], members: int = 1) -> None:
-        results[name] = [members * rate for rate in updates_per_second(train, options.seconds)]
-        print(f"  {name}: {max(results[name]):,.0f} updates/s", flush=True)
+    def measured(name: str, train: Callable[[int], None], trained: Any = None, members: int = 1) -> None:
+        results[name] = [members * rate for rate in updates_per_second(train, device, options.seconds)]
+        if trained is not None:  # the compiler may be missing or have failed
+            engine = trained._engine
+            uncompiled = engine.execution == "cudagraph" and not engine.is_compiled
+            facts["run as"][name] = engine.execution + (", not compiled" if uncompiled else "")
+        print(f"  {name}: {max(results[name]):,.0f} updates/s {facts['run as'].get(name, '')}", flush=True)
         write(options.out, facts, results)  # at once: the time on the device may end
 
     sac = filled_sac(transitions, options.device)
@@ -77,15 +84,13 @@ def main() -> None:
         for execution in ("eager", "compile", "cudagraph") if precision == "float32" else ("cudagraph",):
             model = OfflineDCE("MlpPolicy", execution=execution, precision=precision, device=options.device, **common)
             name = f"DCE, {execution}, {precision}"
-            measured(name, lambda n, model=model: model.train(n, BATCH))
-            assert model._engine is not None
-            facts.setdefault("run as", {})[name] = model._engine.execution  # the compiler may have failed
+            measured(name, lambda n, model=model: model.train(n, BATCH), model)
         for k in map(int, options.members.split(",")):
             members = [
                 OfflineDCE("MlpPolicy", precision=precision, device="cpu", **{**common, "seed": seed}) for seed in range(k)
             ]
             population = Population(members, options.device, "cudagraph")
-            measured(f"{k} x DCE, cudagraph, {precision}", lambda n, p=population: p.train(n), k)
+            measured(f"{k} x DCE, cudagraph, {precision}", lambda n, p=population: p.train(n), population, k)
             del population, members
     print(write(options.out, facts, results))
 
@@ -103,10 +108,12 @@ def write(out: Path, facts: dict[str, Any], results: dict[str, list[float]]) -> 
         f"PyTorch {facts['torch']}, {facts['date']}; batch {BATCH}, 256-256 networks, random numbers of HalfCheetah's shape. "
         "Best of three repeats; a population counts the updates of all members.",
         "",
-        "| | member-updates/s | least - most |",
-        "|---|---|---|",
-        *(f"| {name} | {max(rates):,.0f} | {min(rates):,.0f} - {max(rates):,.0f} |" for name, rates in results.items()),
+        "| | run as | member-updates/s | least - most |",
+        "|---|---|---|---|",
     ]
+    for name, rates in results.items():
+        way = facts["run as"].get(name, "-")
+        lines.append(f"| {name} | {way} | {max(rates):,.0f} | {min(rates):,.0f} - {max(rates):,.0f} |")
     text = "\n".join(lines) + "\n"
     out.parent.mkdir(parents=True, exist_ok=True)
     document = json.dumps({"facts": facts, "rates": results}, indent=1)

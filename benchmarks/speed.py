@@ -2,7 +2,7 @@
 Seconds per 1000 updates of every agent and way of running it, against Stable-Baselines3's SAC on the same core.
 
     python benchmarks/speed.py                           # everything; about twenty minutes
-    python benchmarks/speed.py --only dce,sac --repeats 9
+    python benchmarks/speed.py --only dce,offline_sac --repeats 9
 
 CQL and UWAC are measured after their first phases, in which the actor ignores the critics, which is cheaper and 4 % of a run.
 All entries take turns in one process pinned to one core, so that whatever else the machine does hits all of them alike;
@@ -34,6 +34,7 @@ from stable_baselines3.common.logger import Logger
 
 from sb3_dce import Transitions
 from sb3_dce.agents import AGENTS
+from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.envs import SpacesEnv
 from sb3_dce.warm_up import ActorWarmUp
 
@@ -75,6 +76,19 @@ def filled_sac(transitions: Transitions, device: str) -> SAC:
     return sac
 
 
+def make_agent(agent: type[OfflineAlgorithm], transitions: Transitions, execution: str, precision: str) -> OfflineAlgorithm:
+    """
+    :param agent: class
+    :param transitions: data
+    :param execution: "eager", "compile"
+    :param precision: of the matrix products
+    :return: agent on the processor, after its first phase if it has one
+    """
+    settings: dict[str, Any] = {"policy_eval_start": 0} if issubclass(agent, ActorWarmUp) else {}
+    settings.update(execution=execution, precision=precision, batch_size=BATCH, seed=0, device="cpu")
+    return agent("MlpPolicy", make_env(), transitions, **settings)
+
+
 def make_entries(transitions: Transitions, only: list[str], executions: list[str], precision: str) -> dict[str, Train]:
     """
     :param transitions: data of all
@@ -83,7 +97,7 @@ def make_entries(transitions: Transitions, only: list[str], executions: list[str
     :param precision: of the agents' matrix products
     :return: by name, a function that runs so many updates
     """
-    env, sac = make_env(), filled_sac(transitions, "cpu")
+    sac = filled_sac(transitions, "cpu")
     buffer = sac.replay_buffer
     assert buffer is not None
     entries: dict[str, Train] = {SAC_NAME: lambda n: sac.train(n, BATCH)}
@@ -91,14 +105,11 @@ def make_entries(transitions: Transitions, only: list[str], executions: list[str
         if only and algo not in only:
             continue
         for execution in executions:
-            settings = {"execution": execution, "precision": precision, "batch_size": BATCH, "seed": 0, "device": "cpu"}
-            if issubclass(agent, ActorWarmUp):
-                settings["policy_eval_start"] = 0
-            model = agent("MlpPolicy", env, transitions, **settings)
+            model = make_agent(agent, transitions, execution, precision)
             model._total_timesteps = LONG_RUN
             entries[f"{algo}, {execution}"] = lambda n, model=model: model.train(n, BATCH)
             if algo == "dce" and MANNER_NAME not in entries:
-                policy = agent("MlpPolicy", env, transitions, seed=0, device="cpu").policy
+                policy = make_agent(agent, transitions, "eager", "float32").policy
                 entries[MANNER_NAME] = SB3MannerDCE(policy, buffer, BATCH).train
     return entries
 
@@ -164,8 +175,9 @@ def report(times: dict[str, list[tuple[float, float]]], first: dict[str, float],
     :param facts: machine, versions, settings
     :return: Markdown
     """
-    reference = [cpu for _, cpu in times[SAC_NAME]]
-    manner = [cpu for _, cpu in times.get(MANNER_NAME, times[SAC_NAME])]
+    # the second reference is measured with DCE only
+    against = {SAC_NAME: "times SB3 SAC", MANNER_NAME: "times SB3-manner DCE"}
+    references = {title: [cpu for _, cpu in times[name]] for name, title in against.items() if name in times}
     lines = [
         f"# Speed of updates, {facts['precision']}",
         "",
@@ -175,17 +187,16 @@ def report(times: dict[str, list[tuple[float, float]]], first: dict[str, float],
         f"Medians over {facts['repeats']} turns; CPU "
         f"seconds, since other programs may run (wall/CPU in the last column but one). `{facts['command']}`",
         "",
-        "| | CPU s per 1000 updates | least - most | times SB3 SAC | times SB3-manner DCE | wall/CPU | first update, s |",
-        "|---|---|---|---|---|---|---|",
+        f"| | CPU s per 1000 updates | least - most | {' | '.join(references)} | wall/CPU | first update, s |",
+        "|---|---|---|---|---|" + "---|" * len(references),
     ]
     for name, pairs in times.items():
         cpu = [pair[1] for pair in pairs]
         waits = statistics.median(wall / used for wall, used in pairs)
-        against_sac = statistics.median(r / c for r, c in zip(reference, cpu, strict=True))
-        against_manner = statistics.median(r / c for r, c in zip(manner, cpu, strict=True))
+        ratios = [statistics.median(r / c for r, c in zip(theirs, cpu, strict=True)) for theirs in references.values()]
         lines.append(
-            f"| {name} | {statistics.median(cpu):.2f} | {min(cpu):.2f} - {max(cpu):.2f} | {against_sac:.2f} | "
-            f"{against_manner:.2f} | {waits:.2f} | {first[name]:.1f} |"
+            f"| {name} | {statistics.median(cpu):.2f} | {min(cpu):.2f} - {max(cpu):.2f} | "
+            f"{' | '.join(f'{ratio:.2f}' for ratio in ratios)} | {waits:.2f} | {first[name]:.1f} |"
         )
     contended = sum(wall / cpu > MAX_WALL_PER_CPU for pairs in times.values() for wall, cpu in pairs)
     total = sum(len(pairs) for pairs in times.values())
@@ -209,6 +220,9 @@ def main() -> None:
     parser.add_argument("--core", type=int, default=None, help="core to run on; default: the last one")
     parser.add_argument("--out", type=Path, default=RESULTS / "speed")
     options = parser.parse_args()
+    only = [name for name in options.only.split(",") if name]
+    if unknown := set(only) - set(AGENTS):
+        parser.error(f"--only: no agent is called {', '.join(sorted(unknown))}; there are {', '.join(AGENTS)}")
 
     if hasattr(os, "sched_setaffinity"):
         cores = sorted(os.sched_getaffinity(0))
@@ -218,7 +232,6 @@ def main() -> None:
     arrays = make_arrays(options.rows)
     transitions = Transitions.from_arrays(**arrays)
     del arrays
-    only = [name for name in options.only.split(",") if name]
     entries = make_entries(transitions, only, options.executions.split(","), options.precision)
     updates, first = warm_up(entries)
     times = measure(entries, updates, options.repeats)

@@ -29,11 +29,11 @@ from sb3_dce.data.minari import is_minari_name
 from sb3_dce.envs import SpacesEnv, dataset_spaces, make_env_if_possible, own_env
 from sb3_dce.errors import (
     ConfigError,
+    DatasetFormatError,
     DatasetIntegrityError,
     DatasetNotFoundError,
     DatasetSemanticsError,
     DatasetWarning,
-    SB3DCEError,
     SB3DCEWarning,
 )
 from sb3_dce.networks import StandardizedExtractor
@@ -170,22 +170,37 @@ class AttachingMixin(OffPolicyAlgorithm):
 
         :param path: file that ``save_replay_buffer`` wrote. It is a pickle: open only files you trust
         :param truncate_last_traj: kept for Stable-Baselines3
-        :raises DatasetFormatError: if its observations or actions have other widths than the model's
+        :raises DatasetNotFoundError: if there is no such file
+        :raises DatasetFormatError: if it holds no buffer, or its observations or actions have other widths than the model's
         :raises DatasetSemanticsError: if its actions were scaled from other bounds than the model's
         """
         before = self.replay_buffer
-        super().load_replay_buffer(path, truncate_last_traj)
-        if not isinstance(self.replay_buffer, OfflineReplayBuffer):
-            self.set_dataset(Transitions.from_replay_buffer(self.replay_buffer))
-            return
         try:
-            self.replay_buffer.check_fits(self.observation_space, self.action_space, where=str(path))
-        except SB3DCEError:
+            self._take_saved_buffer(path, truncate_last_traj)
+        except BaseException:  # the parent has put in whatever the file holds
             self.replay_buffer = before
             raise
-        if self.dataset_statistics is not None and self.replay_buffer.size() > 0:
-            if self.dataset_statistics.get("sample_hash") != self.replay_buffer.sample_hash():
-                self.forget_rows()
+
+    def _take_saved_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool) -> None:
+        hint = "Give the file that save_replay_buffer() has written."
+        try:
+            super().load_replay_buffer(path, truncate_last_traj)
+        except FileNotFoundError as exc:
+            raise DatasetNotFoundError("no such file", where=str(path), hint=hint) from exc
+        except Exception as exc:  # whatever the code in a pickle raises
+            what = f"cannot be loaded as a replay buffer ({type(exc).__name__}: {exc})"
+            raise DatasetFormatError(what, where=str(path), hint=hint) from exc
+        loaded: Any = self.replay_buffer
+        if isinstance(loaded, OfflineReplayBuffer):
+            loaded.check_fits(self.observation_space, self.action_space, where=str(path))
+            if self.dataset_statistics is not None and loaded.size() > 0:
+                if self.dataset_statistics.get("sample_hash") != loaded.sample_hash():
+                    self.forget_rows()
+            return
+        transitions = Transitions.from_replay_buffer(loaded)
+        empty = OfflineReplayBuffer(1, loaded.observation_space, loaded.action_space, self.device)
+        empty.check_fits(self.observation_space, self.action_space, where=str(path))
+        self.set_dataset(transitions)
 
     def _own_buffer(self) -> OfflineReplayBuffer:
         if not isinstance(self.replay_buffer, OfflineReplayBuffer):
@@ -298,26 +313,29 @@ class AttachingMixin(OffPolicyAlgorithm):
                 self._warn_of_misfits(buffer)
             return
         transitions, known = self._load_transitions(), self.dataset_statistics
-        buffer.attach(transitions, self.chosen_rows(transitions))
-        info = transitions.info
-        self.dataset_statistics = {
-            "rows": buffer.size(),
-            "reward_mean": float(info.reward_mean),
-            "reward_abs_max": float(max(abs(info.reward_min), abs(info.reward_max))),
-            "return_range": info.return_range if self.trained_return_range is None else self.trained_return_range,
-            "n_terminals": int(info.n_terminals),
-            "sample_hash": buffer.sample_hash(),
-        }
-        if known is not None and (changes := _changes(known, self.dataset_statistics)):
-            self.dataset_statistics = known
+        try:
+            buffer.attach(transitions, self.chosen_rows(transitions))
+            info = transitions.info
+            self.dataset_statistics = {
+                "rows": buffer.size(),
+                "reward_mean": float(info.reward_mean),
+                "reward_abs_max": float(max(abs(info.reward_min), abs(info.reward_max))),
+                "return_range": info.return_range if self.trained_return_range is None else self.trained_return_range,
+                "n_terminals": int(info.n_terminals),
+                "sample_hash": buffer.sample_hash(),
+            }
+            if known is not None and (changes := _changes(known, self.dataset_statistics)):
+                raise DatasetIntegrityError(
+                    f"these are not the rows the model was trained on: {changes}",
+                    where=self.dataset,
+                    hint="Read the data as before and give them to model.set_dataset(...); it also takes other data.",
+                )
+            self._warn_of_misfits(buffer)
+            self._standardize(buffer.observations)
+        except BaseException:  # with rows in it the buffer would pass for attached at the next call
             buffer.reset()
-            raise DatasetIntegrityError(
-                f"these are not the rows the model was trained on: {changes}",
-                where=self.dataset,
-                hint="Read the data as before and give them to model.set_dataset(...); it also takes other data.",
-            )
-        self._warn_of_misfits(buffer)
-        self._standardize(buffer.observations)
+            self.dataset_statistics = known
+            raise
         self._transitions = None  # the buffer holds the rows now
 
     def _warn_of_misfits(self, buffer: OfflineReplayBuffer) -> None:
@@ -383,7 +401,10 @@ class AttachingMixin(OffPolicyAlgorithm):
                     DatasetWarning,
                 )
             env.obs_rms = RunningMeanStd(shape=rms.mean.shape)
-            env.obs_rms.update(buffer.observations[: buffer.size(), 0])
+            rows = buffer.observations[: buffer.size(), 0]
+            # its own update() would add up in float32, which over a million rows shifts a mean by a hundredth
+            moments = (moment(axis=0, dtype=np.float64) for moment in (rows.mean, rows.var))
+            env.obs_rms.update_from_moments(*moments, len(rows))
         self.vec_normalize_statistics = (env.obs_rms.mean.copy(), env.obs_rms.var.copy())
 
     def check_dataset_fits(self, reward_mean: float, n_terminals: int) -> list[str]:

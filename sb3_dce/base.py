@@ -415,7 +415,8 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
         if known is None or known.engine is not engine or known.batch_size != batch_size:
             self._rewind = Rewind.of(self, engine, batch_size)
         assert buffer.rows is not None
-        source = (buffer.rows.data_ptr(), buffer.size(), batch_size, self.precision, tuple(specs.items()))
+        rows = (buffer.rows.data_ptr(), buffer.size())
+        source = (batch_size, self.precision, tuple(specs.items()))
 
         def draw() -> tuple[ReplayBufferSamples, dict[str, th.Tensor]]:
             batch = buffer.gather(self.draw_rows(generator, batch_size), self._vec_normalize_env)
@@ -431,7 +432,7 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
                 # The networks of an update are written one after the other. The first call may compile for a minute.
                 with UninterruptedBlock() if engine.has_run(variant) else nullcontext():
                     coef = self._coefficient_tensors(dtype)
-                    engine.step_drawn(draw, coef, on_device, source, **variant)
+                    engine.step_drawn(draw, coef, on_device, rows, source, **variant)
                     self._n_updates += 1
                     if self.reads_state_after(self._n_updates):
                         self.read_state(engine.state.read())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import sys
 import tempfile
@@ -31,6 +32,9 @@ app = typer.Typer(
 app.add_typer(cli_datasets.app, name="datasets")
 
 console = Console(highlight=False)
+
+# Exit code of an error that nobody foresaw: EX_SOFTWARE of sysexits.h, which no command gives as a verdict.
+UNFORESEEN = 70
 
 # Arguments of the agents that these commands set themselves.
 NOT_FOR_SET = {
@@ -267,21 +271,28 @@ def _parse_overrides(pairs: list[str]) -> dict[str, Any]:
         if not equals or not key:
             raise ConfigError(f"--set wants KEY=VALUE, got {pair!r}", key="--set", hint="For example --set beta=2.0.")
         try:
-            value = yaml.safe_load(text)
+            value = _as_meant(yaml.safe_load(text))
         except (yaml.YAMLError, ValueError, RecursionError) as error:
             example = "For example --set policy_kwargs={net_arch: [64]}."
             raise ConfigError(f"--set {key}: {text[:60]!r} is no YAML value", key="--set", hint=example) from error
-        if isinstance(value, str):  # YAML 1.1 takes 3e-4 for text
-            try:
-                value = float(value)
-            except ValueError:
-                pass
-        if isinstance(value, str) and value.lower() == "none":
-            value = None
         if (other := NOT_FOR_SET.get(key.strip().rpartition(".")[2])) is not None:
             raise ConfigError(f"--set {pair} sets no hyperparameter", key="--set", hint=other)
         overrides[key.strip()] = value
     return overrides
+
+
+def _as_meant(value: Any) -> Any:
+    """YAML 1.1 takes 3e-4 and None for text."""
+    if isinstance(value, dict):
+        return {key: _as_meant(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_as_meant(item) for item in value]
+    if not isinstance(value, str):
+        return value
+    try:
+        return float(value)
+    except ValueError:
+        return None if value.lower() == "none" else value
 
 
 def _parse_lengths(pairs: list[str]) -> dict[str, int]:
@@ -301,8 +312,9 @@ def _parse_lengths(pairs: list[str]) -> dict[str, int]:
 
 def main() -> None:
     """
-    Entry point: errors of this package are one message on stderr and exit code 2, others exit code 1 and a report in a file;
-    never a traceback. Ctrl-C is exit code 130, typer's, and SIGTERM 143, as shells have it.
+    Entry point: errors of this package are one message on stderr and exit code 2, those nobody foresaw exit code 70, that of
+    BSD for them, and a report in a file; never a traceback. Exit code 1 is a verdict of ``datasets check`` and ``datasets
+    compare``. Ctrl-C is exit code 130, typer's, and SIGTERM 143, as shells have it.
     """
     show_warnings_as_lines()
     for stream in (sys.stdout, sys.stderr):  # an encoding without a sign such as ± is no reason to end a training
@@ -325,11 +337,13 @@ def main() -> None:
         sys.exit(2)
     except Exception as error:
         # A mistake of ours, or memory that ran out: what happened is kept for a report, and is no page in the terminal.
-        with tempfile.NamedTemporaryFile("w", prefix="sb3-dce-", suffix=".txt", delete=False, encoding="utf-8") as file:
-            file.write(traceback.format_exc())
+        report = ""
+        with contextlib.suppress(OSError):  # where no folder can be written the message has to do
+            with tempfile.NamedTemporaryFile("w", prefix="sb3-dce-", suffix=".txt", delete=False, encoding="utf-8") as file:
+                file.write(traceback.format_exc())
+            report = f" The whole report, for an issue: {file.name}"
         Console(stderr=True, highlight=False, soft_wrap=True).print(
-            f"Error: {type(error).__name__}: {str(error).strip()[:500]}\nThis should have been said more clearly. The whole "
-            f"report, for an issue: {file.name}",
+            f"Error: {type(error).__name__}: {str(error).strip()[:500]}\nThis should have been said more clearly.{report}",
             markup=False,
         )
-        sys.exit(1)
+        sys.exit(UNFORESEEN)

@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from sb3_dce import cli_recording
+from sb3_dce.errors import ConfigError, DatasetFormatError
 
 if TYPE_CHECKING:
     from sb3_dce.data.examination import Check
@@ -70,9 +71,15 @@ def dataset_info(
         Path | None, typer.Option(show_default=False, help="Also write what [b]datasets compare[/b] needs, a small JSON file.")
     ] = None,
 ) -> None:
-    """Read a dataset, check it, and say what is in it."""
+    """Read a dataset, check it, and say what is in it. An existing file is replaced only if it is a card."""
     from sb3_dce.data.comparison import DatasetCard
 
+    if card is not None and card.is_file():
+        try:
+            DatasetCard.read(card)
+        except DatasetFormatError as error:
+            hint = "Choose another name, or delete the file."
+            raise ConfigError("this file exists and is no card", where=str(card), key="--card", hint=hint) from error
     transitions = _read_quietly(dataset)
     for line in transitions.summary():
         console.print(line, markup=False)
@@ -239,7 +246,6 @@ def download_dataset(
 
     if is_minari_name(dataset):
         from sb3_dce.data.minari_download import REMOTE_VARIABLE, download_minari
-        from sb3_dce.errors import ConfigError
 
         if cache_dir is not None or mirror or sha256:
             raise ConfigError(

@@ -155,11 +155,11 @@ def report(dataset: str, algos: Sequence[str], out: Path | None, console: Consol
         config = read_config(path)
         if config is None or (wanted and config["run"]["algo"] not in wanted):
             continue
-        result = read_result(path)
-        if result is None and read_divergence(path) is None:
+        result, divergence = read_result(path), read_divergence(path)
+        if result is None and divergence is None:
             continue
-        # a complete run may be on its way to become a longer one
-        spec = spec_from(config["run"] if result is None else result["config"], path)
+        # a complete run may be on its way to become a longer one, which is the one that diverged if one has
+        spec = spec_from(config["run"] if result is None or divergence is not None else result["config"], path)
         if config["dataset"]["sha256"] != here:
             what = f"trained on another file ({config['dataset']['name']}) than {dataset}"
             raise ConfigError(what, where=str(path), hint="Name that one, or another folder with --out.")

@@ -30,6 +30,8 @@ DATASET = "halfcheetah-demo-sb3"
 N_UPDATES = 20_000
 EVAL_FREQ = 5_000
 N_EVAL_EPISODES = 10
+# In results.json, which is told by them from a file of another program.
+ROWS = {"random", "data", "BC", "DCE"}
 
 # Small networks and a larger step than the paper's, so that a few minutes on two cores are enough; both agents get them.
 # The values were chosen on seeds 100 and up, not on those the demo runs.
@@ -59,11 +61,12 @@ def run_demo(folder: Path, n_seeds: int, fresh: bool, console: Console) -> dict[
     :param fresh: delete earlier results in the folder first
     :param console: where to print
     :return: the table, by agent
-    :raises ConfigError: if the simulator is not installed
+    :raises ConfigError: if the simulator is not installed, or files are in the way that no demo wrote
     """
     missing = missing_simulator(resolve(DATASET))
     if missing is not None:
         raise ConfigError(missing.reason, key=missing.package, hint=missing.remedy)
+    _refuse_other_files(folder)
     if fresh and folder.exists():
         _delete_demo(folder)
     transitions = load_transitions(DATASET)
@@ -104,18 +107,33 @@ def run_demo(folder: Path, n_seeds: int, fresh: bool, console: Console) -> dict[
     return table
 
 
+def _refuse_other_files(folder: Path) -> None:
+    """Files that a demo would replace or delete, though another program wrote them."""
+    table, picture = (folder / name for name in ("results.json", "learning_curve.png"))
+    try:
+        has_table = set(json.loads(table.read_bytes())) == ROWS
+    except (OSError, ValueError, TypeError):
+        has_table = False
+    ours = {table: has_table, picture: has_table or any(_is_run_of_demo(path) for path in folder.glob("*_*"))}
+    for path, is_ours in ours.items():
+        if path.exists() and not is_ours:
+            hint = "Choose another folder with --out, or move the file away."
+            raise ConfigError("a demo would replace this file, and none wrote it", where=str(path), key="--out", hint=hint)
+
+
 def _delete_demo(folder: Path) -> None:
     """Delete what a demo wrote, and nothing else that may lie in the folder."""
     for path in folder.iterdir():
         if _is_run_of_demo(path):
             with alone(path):
-                for inner in path.iterdir():
+                # what says that it is a demo's goes last: whoever is interrupted can delete the rest with the same command
+                for inner in sorted(path.iterdir(), key=lambda inner: inner.name == "config.yml"):
                     if inner.name == ".lock":  # it is open, which some systems do not let one delete
                         continue
                     shutil.rmtree(inner) if inner.is_dir() else inner.unlink()
             shutil.rmtree(path, ignore_errors=True)
-        elif path.name in ("results.json", "learning_curve.png"):
-            path.unlink()
+    for name in ("learning_curve.png", "results.json"):
+        (folder / name).unlink(missing_ok=True)
 
 
 def _is_run_of_demo(path: Path) -> bool:

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import contextlib
 import io
-import multiprocessing as mp
 import pickle
+import signal
 from collections.abc import Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -23,7 +23,7 @@ from stable_baselines3.common.policies import BasePolicy
 from sb3_dce.checks import check_number
 from sb3_dce.errors import ConfigError, SB3DCEError
 from sb3_dce.mlp_actor import ActorSnapshot, MLPActor, actor_snapshot
-from sb3_dce.processes import end_workers, prepare_worker
+from sb3_dce.processes import end_workers, prepare_worker, starting_workers, worker_pool
 from sb3_dce.rollouts import (
     Act,
     Ending,
@@ -49,10 +49,11 @@ class PendingEpisodes:
     Episodes that are played now or later.
 
     :param parts: of one evaluation
+    :param executor: what plays them; ``None`` if they have been played
     """
 
-    def __init__(self, parts: Sequence[Future[list[Ending]]]) -> None:
-        self._parts = parts
+    def __init__(self, parts: Sequence[Future[list[Ending]]], executor: ProcessPoolExecutor | None = None) -> None:
+        self._parts, self._executor = parts, executor
 
     def result(self) -> Episodes:
         """
@@ -67,6 +68,8 @@ class PendingEpisodes:
         except SB3DCEError:
             raise
         except BrokenProcessPool as error:
+            if self._executor is not None:
+                end_workers(self._executor)  # the others do not listen to the SIGTERM by which Python ends them
             raise EvaluationFailedError(
                 "a worker process of the evaluation has ended unexpectedly",
                 hint="In a script, training must begin below `if __name__ == '__main__':`. Otherwise the process was killed, "
@@ -132,11 +135,13 @@ class EvaluationPool:
         shares = [range(k, rollouts.n_envs, parts) for k in range(parts)]
         executor = self._started()
         try:
-            return PendingEpisodes([executor.submit(_play, payload, recipe, seed, share) for share in shares])
+            with starting_workers():
+                played = [executor.submit(_play, payload, recipe, seed, share) for share in shares]
+            return PendingEpisodes(played, executor)
         except BrokenProcessPool as error:
             broken: Future[list[Ending]] = Future()
             broken.set_exception(error)
-            return PendingEpisodes([broken])
+            return PendingEpisodes([broken], executor)
 
     def close(self) -> None:
         """End the workers; what they are at is lost."""
@@ -152,8 +157,7 @@ class EvaluationPool:
 
     def _started(self) -> ProcessPoolExecutor:
         if self._executor is None:
-            context = mp.get_context("spawn")
-            self._executor = ProcessPoolExecutor(self.n_workers, mp_context=context, initializer=_prepare)
+            self._executor = worker_pool(self.n_workers, _prepare)
         return self._executor
 
 
@@ -180,6 +184,8 @@ _rollouts: dict[tuple[str, int, int], Rollouts] = {}
 
 
 def _prepare() -> None:
+    # as Ctrl-C for the parent, which waits for the episodes before it saves; it ends its workers by a signal of another kind
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     prepare_worker()
     th.set_num_threads(1)
 

@@ -81,7 +81,8 @@ def choose_execution(execution: str, planned_updates: int, device: th.device) ->
     :param execution: "auto", "eager", "compile" or "cudagraph"
     :param planned_updates: updates the caller is going to run
     :param device: where the model lies
-    :return: one of the last three; what cannot be had falls back to the next simpler one, with a warning if it was asked for
+    :return: one of the last three; what cannot be had falls back to the next simpler one, with a warning if it was asked for;
+        without a compiler the update is captured uncompiled
     """
     wanted = execution
     if execution == "auto":
@@ -92,15 +93,16 @@ def choose_execution(execution: str, planned_updates: int, device: th.device) ->
             f"execution='cudagraph' needs a model on a CUDA device, this one is on {device}: trying 'compile'.", SB3DCEWarning
         )
         wanted = "compile"
-    if wanted == "compile" and not _has_compiler():
-        if execution != "auto":
-            warnings.warn(
-                f"execution={execution!r} needs a C++ compiler (g++ or clang++) on the PATH and the headers of Python "
-                "(python3-dev), and did not find both: running eager.",
-                SB3DCEWarning,
-            )
-        return "eager"
-    return wanted
+    if wanted == "eager" or _has_compiler():
+        return wanted
+    way = "running eager" if wanted == "compile" else "capturing the update as it is"
+    if execution != "auto":
+        warnings.warn(
+            f"execution={execution!r} needs a C++ compiler (g++ or clang++) on the PATH and the headers of Python "
+            f"(python3-dev), and did not find both: {way}.",
+            SB3DCEWarning,
+        )
+    return "eager" if wanted == "compile" else wanted
 
 
 def _has_compiler() -> bool:
@@ -151,20 +153,23 @@ class Engine(Generic[S]):
         compiled_caller = on_cpu and planned_updates >= UPDATES_WORTH_A_COMPILED_CALLER
         self._compiler_options: dict[str, Any] | None = {"cpp_wrapper": True} if compiled_caller else None
         self.execution = execution
+        self.is_compiled = execution != "eager"  # False, too, once the compiler was missing or has failed
         self.metrics = MetricSums()
         self._update = update
         self._compiled: dict[Variant, Step] = {}
         self._captured: dict[tuple[Variant, Hashable], CapturedStep] = {}
         self._inputs: dict[Variant, StaticInputs] = {}
-        self._guarded_for: set[tuple[Variant, tuple[th.Size, ...]]] = set()
+        self._guarded_for: set[tuple[Variant, Hashable, tuple[th.Size, ...]]] = set()
         self._has_run: set[Variant] = set()
+        self._rows: Hashable = None
+        self._source: Hashable = None
 
     def has_run(self, variant: dict[str, Any]) -> bool:
         """
         Asked before an update is shielded from interrupts, since the first one of a variant may compile for a minute.
 
         :param variant: choices of an update
-        :return: whether such an update was made, so that nothing is left to be compiled or captured
+        :return: whether such an update was made, so that nothing is left to be compiled; capturing is a matter of a second
         """
         return self.execution == "eager" or tuple(sorted(variant.items())) in self._has_run
 
@@ -193,7 +198,13 @@ class Engine(Generic[S]):
                 self._replay(self._captured_step(key, lambda: inputs, coef))
 
     def step_drawn(
-        self, draw: Draw, coef: dict[str, th.Tensor], generator: th.Generator | None, source: Hashable, **variant: Any
+        self,
+        draw: Draw,
+        coef: dict[str, th.Tensor],
+        generator: th.Generator | None,
+        rows: Hashable,
+        source: Hashable,
+        **variant: Any,
     ) -> None:
         """
         One update on rows and noise that are still to be drawn; a captured update draws them itself.
@@ -201,9 +212,13 @@ class Engine(Generic[S]):
         :param draw: draws and gathers; on a CUDA device without a detour over the processor
         :param coef: coefficients, the same tensors at every call
         :param generator: what ``draw`` draws with, or ``None`` if it does take that detour
-        :param source: changes when ``draw`` has another number or place of rows
+        :param rows: changes when ``draw`` reads other rows or another number of them; what was captured is released then
+        :param source: changes when ``draw`` draws in another way, or products are computed in another precision
         :param variant: choices fixed at trace time, such as ``with_actor``
         """
+        if rows != self._rows:
+            self._captured.clear()
+        self._rows, self._source = rows, source
         if self.execution != "cudagraph" or generator is None:
             self.step(*draw(), coef, **variant)
             self._has_run.add(tuple(sorted(variant.items())))
@@ -224,16 +239,17 @@ class Engine(Generic[S]):
     def _guards_evaluated_once(self, key: Variant, batch: Any) -> Iterator[None]:
         """
         PyTorch asks at each call whether the graph still fits its arguments, which takes as long as a matrix product of the
-        update. Of what it asks, only the number of rows can change from one call to the next; while it stays, once is enough.
+        update. Of what it asks, only the number of rows and the precision can change from one call to the next; while they
+        stay, once is enough.
         """
-        sizes = tuple(leaf.shape for leaf in tree_leaves(batch) if isinstance(leaf, th.Tensor))
-        if (key, sizes) in self._guarded_for:
+        fits = (key, self._source, tuple(leaf.shape for leaf in tree_leaves(batch) if isinstance(leaf, th.Tensor)))
+        if fits in self._guarded_for:
             with th.compiler.set_stance(skip_guard_eval_unsafe=True):
                 yield
         else:
             with _room_for_compiled_updates():
                 yield
-            self._guarded_for.add((key, sizes))
+            self._guarded_for.add(fits)
 
     def _compiled_step(self, key: Variant) -> Step:
         if key not in self._compiled:
@@ -256,7 +272,7 @@ class Engine(Generic[S]):
                     raise  # whatever would follow could not become part of this capture
                 way = "capturing it as it is" if self.execution == "cudagraph" else "running eager"
                 warnings.warn(f"compiling the update failed, {way}: {_cause(error)}", SB3DCEWarning)
-                self._compiled[key] = self._in_place(dict(key))
+                self._compiled[key], self.is_compiled = self._in_place(dict(key)), False
                 if self.execution == "compile":
                     self.execution = "eager"
                 metrics = self._compiled[key](*arguments)
@@ -274,7 +290,9 @@ class Engine(Generic[S]):
     ) -> CapturedStep:
         captured = self._captured.get((key, source))
         if captured is None or not captured.reads(coef, generator):
-            step = self._compiled_step(key) if _has_compiler() else self._in_place(dict(key))
+            compiler = _has_compiler()
+            self.is_compiled = self.is_compiled and compiler
+            step = self._compiled_step(key) if compiler else self._in_place(dict(key))
             captured = CapturedStep(step, self.state.read(), draw, coef, self.metrics, generator)
             self._captured[key, source] = captured
         return captured

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import glob
 import os
 import pathlib
@@ -169,6 +170,10 @@ def check_writable(target: pathlib.Path) -> None:
             pass
     except OSError as error:
         raise cannot_write(target, error) from error
+
+
+# Why a write fails that is nobody's mistake: no space, the user's share of it used up, a disk that became read-only.
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
 def cannot_write(target: pathlib.Path, error: OSError) -> CheckpointError:

@@ -23,8 +23,15 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from sb3_dce import runs
 from sb3_dce.errors import DivergenceError, SB3DCEError
 from sb3_dce.evaluation import Evaluation
+from sb3_dce.files import DISK_FULL, cannot_write
 from sb3_dce.messages import show_warnings_as_lines
-from sb3_dce.processes import prepare_worker, termination_as_interrupt, threads_from_environment, usable_cores
+from sb3_dce.processes import (
+    prepare_worker,
+    starting_workers,
+    termination_as_interrupt,
+    threads_from_environment,
+    usable_cores,
+)
 from sb3_dce.run_files import RunSpec, write_divergence
 from sb3_dce.runs import StoppedError
 
@@ -32,6 +39,8 @@ from sb3_dce.runs import StoppedError
 BARS_KEPT = 20
 # How long runs may take to save when they are interrupted: the rest of an evaluation, or of compiling.
 SAVING_SECONDS = 120.0
+# What printing ends in when the reader of a pipe has gone, which rich turns into an exit, or the disk of a log file is full.
+UNSEEN = (OSError, SystemExit)
 
 
 class RunFailedError(SB3DCEError):
@@ -133,7 +142,8 @@ class _Workers:
                     here, there = self._context.Pipe()
                     with there:  # the process has it then, and with the process it closes
                         process = self._context.Process(target=_serve, args=(there, self._threads, self._stop))
-                        process.start()
+                        with starting_workers():
+                            process.start()
                 except OSError as error:
                     hint = "Use fewer --workers; the same command goes on."
                     raise RunFailedError(f"no process for {name}: {error.strerror or error}", hint=hint) from error
@@ -215,27 +225,39 @@ def _wait(futures: Sequence[Future[Any]], keep_going: bool) -> None:
 
 def _save_and_end(futures: Sequence[Future[Any]], workers: _Workers, console: Console) -> None:
     """Let each run save where it is; a second Ctrl-C does not wait for that."""
-    console.print("Interrupted: saving what is being trained. Ctrl-C again ends at once.", markup=False)
     begun = [future for future in futures if not future.cancel()]
     workers.save_and_end()
+    say(console, "Interrupted: saving what is being trained. Ctrl-C again ends at once.")
     with contextlib.suppress(KeyboardInterrupt):
         wait(begun, SAVING_SECONDS)
     failed = [error for future in begun if future.done() and (error := future.exception()) is not None]
     failed = [error for error in failed if not isinstance(error, StoppedError)]
     for error in failed:
-        console.print(f"failed: {error}", markup=False, soft_wrap=True)
+        say(console, f"failed: {error}")
     saved = not failed and all(future.done() for future in begun)
-    console.print(f"The same command goes on from {'there' if saved else 'the last checkpoints'}.", markup=False)
+    say(console, f"The same command goes on from {'there' if saved else 'the last checkpoints'}.")
 
 
-def progress_display(console: Console) -> Progress:
+def say(console: Console, text: str) -> None:
+    """
+    Print a line about runs that are under way; that nobody can see it ends none of them.
+
+    :param console: where to print
+    :param text: the line
+    """
+    with contextlib.suppress(*UNSEEN):
+        console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def progress_display(console: Console) -> Iterator[Progress]:
     """
     Bars for gradient steps, repainted four times a second in a terminal and hardly ever in a log file.
 
     :param console: where the bars are shown
-    :return: bars with counts, elapsed and remaining time
+    :return: bars with counts, elapsed and remaining time, shown while the block runs
     """
-    return Progress(
+    display = Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
@@ -247,6 +269,12 @@ def progress_display(console: Console) -> Progress:
         # A log file gets the evaluations and the final state, not one line per repaint.
         refresh_per_second=4 if console.is_terminal else 0.02,
     )
+    display.start()
+    try:
+        yield display
+    finally:
+        with contextlib.suppress(*UNSEEN):
+            display.stop()
 
 
 class _Bars:
@@ -267,14 +295,18 @@ class _Bars:
 
         :param event: of one of the runs
         """
+        with contextlib.suppress(*UNSEEN):
+            self._move(event)
+        if event.evaluation is not None:
+            show_evaluation(self._display.console, event.name, event.evaluation)
+
+    def _move(self, event: runs.Progress) -> None:
         total, display = self._totals[event.name], self._display
         if event.name not in self._tasks:
             self._tasks[event.name] = display.add_task(event.name, total=total)
         display.update(self._tasks[event.name], completed=event.n_updates)
         if event.n_updates >= total and len(self._totals) > BARS_KEPT:
             display.remove_task(self._tasks.pop(event.name))
-        if event.evaluation is not None:
-            show_evaluation(display.console, event.name, event.evaluation)
 
 
 def show_evaluation(console: Console, name: str, outcome: Evaluation) -> None:
@@ -286,21 +318,23 @@ def show_evaluation(console: Console, name: str, outcome: Evaluation) -> None:
     :param outcome: of one evaluation
     """
     score = "" if outcome.score is None else f"   score {outcome.score:6.1f}"
-    line = f"  {name:<18} @{outcome.n_updates:>8,}   return {outcome.mean:8.1f} ± {outcome.std:6.1f}{score}"
-    console.print(line, highlight=False)
+    say(console, f"  {name:<18} @{outcome.n_updates:>8,}   return {outcome.mean:8.1f} ± {outcome.std:6.1f}{score}")
 
 
 def _serve(end: Connection, threads: int, stop: Any) -> None:
     """What a process does: train what it is sent, report, send back the result or the error."""
-    prepare_worker()
-    # for the parent, too, which tells when to save; whoever ends a whole group of processes sends it to all of them
+    # as Ctrl-C for the parent, which tells when to save; whoever ends a whole group of processes sends it to all of them
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    prepare_worker()
     show_warnings_as_lines()
     th.set_num_threads(threads)
     with contextlib.suppress(EOFError, ConnectionError):
         while True:
             spec = end.recv()
             try:
+                if stop.value:  # while this process was starting: what there is to save is in the folder
+                    hint = "The same command goes on from there."
+                    raise StoppedError(f"{spec.name} was ended before it began", where=spec.folder, hint=hint)
                 outcome: dict[str, Any] | Exception = train_one(spec, end.send, lambda: bool(stop.value))
             except Exception as error:
                 outcome = error.with_traceback(None)
@@ -316,7 +350,8 @@ def train_one(spec: RunSpec, report: runs.Report, stop: Callable[[], bool] = lam
     :param stop: asked after every update whether to save and end
     :return: its result
     :raises DivergenceError: if it diverges, which is also written down in its folder
-    :raises SB3DCEError: for other errors; the report of an unexpected one is in ``error.txt`` of the folder
+    :raises SB3DCEError: for other errors; the report of an unexpected one is in ``error.txt`` of the folder, if that can be
+        written
     """
     if "torch._dynamo" in sys.modules:
         # What was compiled for an earlier run would stay in memory, and be asked at each call whether it fits.
@@ -330,10 +365,11 @@ def train_one(spec: RunSpec, report: runs.Report, stop: Callable[[], bool] = lam
         raise
     except Exception as error:
         folder = Path(spec.folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
-        raise RunFailedError(
-            f"{spec.name} failed: {type(error).__name__}: {error}",
-            where=str(folder),
-            hint="The whole report is in error.txt there. Without its cause the same command goes on.",
-        ) from None
+        if isinstance(error, OSError) and error.errno in DISK_FULL:  # of a logger: what this package writes says it itself
+            raise cannot_write(Path(error.filename or folder), error) from error
+        hint = "Without its cause the same command goes on."
+        with contextlib.suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / "error.txt").write_text(traceback.format_exc(), encoding="utf-8")
+            hint = f"The whole report is in error.txt there. {hint}"
+        raise RunFailedError(f"{spec.name} failed: {type(error).__name__}: {error}", where=str(folder), hint=hint) from None

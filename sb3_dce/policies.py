@@ -93,7 +93,7 @@ class OfflineSACPolicy(SACPolicy):
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
         if self.critic_weight_decay:
-            self.critic.optimizer.param_groups[0]["weight_decay"] = self.critic_weight_decay
+            self.set_critic_weight_decay()
         self.value_net = self.value_net_target = None
         if not self.use_v:
             return
@@ -110,6 +110,11 @@ class OfflineSACPolicy(SACPolicy):
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> ContinuousCritic:
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         return OfflineCritic(**kwargs, layer_norm=self.critic_layer_norm).to(self.device)
+
+    def set_critic_weight_decay(self) -> None:
+        """Give the critics' optimizer its L2 coefficient, instead of one that a loaded state has brought along."""
+        optimizer = self.critic.optimizer
+        optimizer.param_groups[0]["weight_decay"] = self.critic_weight_decay or optimizer.defaults["weight_decay"]
 
     def make_optimizer(self, network: nn.Module, lr_schedule: Schedule) -> th.optim.Optimizer:
         """

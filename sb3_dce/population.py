@@ -106,6 +106,7 @@ class Population:
         self._coef_values: dict[str, list[float]] = {}
         self._coef_hold_until = 0
         self._engine: Engine[StackedState] | None = None
+        self.is_whole = True  # False during an update, and after one that was interrupted, as by a second Ctrl-C
 
     def __len__(self) -> int:
         return len(self.models)
@@ -147,17 +148,20 @@ class Population:
                 for _ in range(n_updates):
                     variant = first.update_variant(self._n_updates)
                     with UninterruptedBlock() if engine.has_run(variant) else nullcontext():
-                        engine.step_drawn(draw, self._coefficients(total), on_device, source, **variant)
+                        self.is_whole = False
+                        engine.step_drawn(draw, self._coefficients(total), on_device, None, source, **variant)
                         self._n_updates += 1
+                        self.is_whole = True
                         if first.reads_state_after(self._n_updates):
                             for index, model in enumerate(self.models):
                                 model._n_updates = self._n_updates
                                 model.read_state(self.state.member(index))
         finally:
-            for model in self.models:
-                model._n_updates = self._n_updates
-                model.num_timesteps += self._n_updates - before
-            self.commit()
+            with UninterruptedBlock():  # else some members would be of this moment and others of an earlier one
+                for model in self.models:
+                    model._n_updates = self._n_updates
+                    model.num_timesteps += self._n_updates - before
+                self.commit()
 
     def _refuse_replaced(self) -> None:
         """What was written into other tensors would be lost."""
@@ -314,7 +318,8 @@ def check_alike(models: Sequence[OfflineAlgorithm]) -> None:
             found = [name for name in mine if name not in allowed and mine[name] != other[name]]
             kinds = [[type(module) for module in m.policy.modules()] for m in (first, model)]
             shapes = [[p.shape for p in m.policy.parameters()] for m in (first, model)]
-            names = [set(m.make_storages()) for m in (first, model)]
+            storages = [m.make_storages() for m in (first, model)]
+            names = [set(each) for each in storages]
             frozen = [[n for n, p in m.policy.named_parameters() if not p.requires_grad] for m in (first, model)]
             if found:
                 differing, theirs, ours = found[0], other[found[0]], mine[found[0]]
@@ -323,6 +328,8 @@ def check_alike(models: Sequence[OfflineAlgorithm]) -> None:
                 differing = "policy"
             elif shapes[0] != shapes[1]:
                 differing, theirs, ours = "network shapes", model.observation_space, first.observation_space
+            elif (buffer := _differing_buffer(first, model, storages[0])) is not None:
+                differing, ours, theirs = buffer
             elif frozen[0] != frozen[1]:
                 differing, theirs, ours = "frozen parameters", frozen[1], frozen[0]
             elif names[0] != names[1]:
@@ -336,6 +343,25 @@ def check_alike(models: Sequence[OfflineAlgorithm]) -> None:
             key=differing,
             hint="Members may differ in data, seed and numbers such as beta; train the others as a population of their own.",
         )
+
+
+def _differing_buffer(
+    first: OfflineAlgorithm, other: OfflineAlgorithm, storages: dict[str, Storage]
+) -> tuple[str, Any, Any] | None:
+    """
+    A buffer that is not the same in both, with its shapes or its first differing numbers. Statistics of observations may
+    differ, since each member's are applied to it, and what the update changes, which is in the first one's storages.
+    """
+    for path, module in first.policy.named_modules():
+        for name, mine in module.named_buffers(path, recurse=False):
+            its = other.policy.get_buffer(name)
+            if isinstance(module, StandardizedExtractor) or any(storage.holds(mine) for storage in storages.values()):
+                continue
+            if mine.shape != its.shape:
+                return f"shape of buffer {name}", tuple(mine.shape), tuple(its.shape)
+            if (unequal := mine != its).any():
+                return f"buffer {name}", mine[unequal][0].item(), its[unequal][0].item()
+    return None
 
 
 def share_data(models: Sequence[OfflineAlgorithm]) -> None:
@@ -385,8 +411,6 @@ def _standardization(models: Sequence[OfflineAlgorithm], device: th.device) -> t
 
 def _template(model: OfflineAlgorithm, device: th.device) -> OfflineAlgorithm:
     """The model whose networks state the update: a copy, with observations that are standardised already left alone."""
-    if not model.normalize_obs:
-        return model
     template = copy.copy(model)
     template.policy = copy.deepcopy(model.policy).to(device)  # what is no parameter is read from the networks
     for name in model.networks:

@@ -26,9 +26,9 @@ from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.data.locate import catalogue_id
 from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError
 from sb3_dce.evaluation import Evaluation, evaluation_seed, read_evaluations, write_evaluations
-from sb3_dce.evaluation_pool import EvaluationPool, PendingEpisodes
+from sb3_dce.evaluation_pool import EvaluationFailedError, EvaluationPool, PendingEpisodes
 from sb3_dce.files import write_atomically
-from sb3_dce.launch import launch, progress_display, show_evaluation
+from sb3_dce.launch import launch, progress_display, say, show_evaluation
 from sb3_dce.population import Population
 from sb3_dce.processes import termination_as_interrupt, usable_cores
 from sb3_dce.rollouts import Rollouts, rollouts_of
@@ -180,10 +180,9 @@ class BatchedRuns:
             try:
                 self._train(population, display, task, started)
             except KeyboardInterrupt:
-                self.console.print("Interrupted: saving what is being trained.", markup=False)
-                self._collect_evaluations()  # of an earlier moment, whose checkpoint is about to go
-                self._save(population, time.monotonic() - started)
-                self.console.print("The same command goes on from there.", markup=False)
+                say(self.console, "Interrupted: saving what is being trained.")
+                saved = self._save_interrupted(population, started)
+                say(self.console, f"The same command goes on from {'there' if saved else 'the last checkpoint'}.")
                 raise
         self._collect_evaluations()
         return self._finish(population, time.monotonic() - started)
@@ -285,7 +284,7 @@ class BatchedRuns:
             logger.dump(population.n_updates)
             if index not in self._diverged and not np.isfinite(list(metrics.values())).all():
                 self._diverged[index] = population.n_updates
-                self.console.print(f"  {self.specs[index].name} diverged before update {population.n_updates:,}")
+                say(self.console, f"  {self.specs[index].name} diverged before update {population.n_updates:,}")
 
     def _evaluate(self, models: Sequence[OfflineAlgorithm], n_updates: int, members: Sequence[int] | None = None) -> None:
         """
@@ -343,6 +342,20 @@ class BatchedRuns:
             for path in folder.glob("checkpoint_*.zip"):
                 if path.name != _checkpoint(n):
                     path.unlink()
+
+    def _save_interrupted(self, population: Population, started: float) -> bool:
+        """Whether it could be saved; if not, the checkpoint that is there stays."""
+        if not population.is_whole:
+            return False
+        population.commit()  # which may be what was interrupted
+        try:
+            self._collect_evaluations()
+        except EvaluationFailedError as error:
+            say(self.console, f"failed: {error}")
+            if any(n_updates < population.n_updates for _, n_updates, *_ in self._pending):
+                return False  # the checkpoint of that moment is what it can be made again from
+        self._save(population, time.monotonic() - started)
+        return True
 
     def _save_member(self, index: int, model: OfflineAlgorithm, path: Path, n_updates: int) -> bool:
         """Whether it could be saved: a moment that overflowed may show in no metric."""

@@ -8,10 +8,12 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from types import FrameType
+from typing import Any
 
 
 class Terminated(KeyboardInterrupt):
@@ -87,12 +89,28 @@ def usable_cores() -> int:
     """
     Cores this process may use, which a batch system or ``taskset`` may have limited.
 
-    :return: at least 1; at most 61 on Windows, where a pool takes no more
+    :return: at least 1
     """
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    cores = os.cpu_count() or 1
-    return min(cores, 61) if os.name == "nt" else cores
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextmanager
+def starting_workers() -> Iterator[None]:
+    """
+    Processes that are started in the block hear Ctrl-C and SIGTERM only from :func:`prepare_worker` on. A terminal sends them
+    to all of the group, and until the imports are done, seconds later, a process would end with a traceback.
+
+    Windows has no signals that wait.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    resource_tracker.ensure_running()  # the first process starts it, and Python before 3.12 lets the signals through thereby
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPTING)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def prepare_worker() -> None:
@@ -101,6 +119,8 @@ def prepare_worker() -> None:
     which cannot do so, takes its workers with it. Left alone they would stay in memory, or write into what is begun again.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPTING)  # those of the parent's that waited until now
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
@@ -111,6 +131,19 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
+def worker_pool(n_workers: int, prepare: Callable[..., None], *arguments: Any) -> ProcessPoolExecutor:
+    """
+    A pool of new processes, which are started by the first tasks; give it these within :func:`starting_workers`.
+
+    :param n_workers: processes, at least 1; Windows has at most 61 of them
+    :param prepare: called first in each, begins with :func:`prepare_worker`
+    :param arguments: of ``prepare``
+    :return: the pool, to be closed by :func:`end_workers`
+    """
+    size = min(n_workers, 61) if os.name == "nt" else n_workers
+    return ProcessPoolExecutor(size, mp.get_context("spawn"), prepare, arguments)
+
+
 def end_workers(executor: ProcessPoolExecutor) -> None:
     """
     End a pool's processes at once; what they are at is lost.
@@ -118,5 +151,5 @@ def end_workers(executor: ProcessPoolExecutor) -> None:
     :param executor: pool, which takes no more work afterwards
     """
     for process in list((executor._processes or {}).values()):  # shutdown alone would wait for what they are at
-        process.terminate()
+        process.kill()  # SIGTERM may be ignored there
     executor.shutdown(wait=True, cancel_futures=True)

@@ -22,6 +22,7 @@ from sb3_dce.data.catalog import resolve
 from sb3_dce.data.locate import catalogue_id, is_path
 from sb3_dce.data.minari import is_minari_name
 from sb3_dce.envs import make_env_if_possible, missing_simulator, own_env, without_bookkeeping
+from sb3_dce.errors import ConfigError
 from sb3_dce.locomotion import EnvSteps, fast_steps
 from sb3_dce.mlp_actor import MLPActor, actor_snapshot
 from sb3_dce.normalizing import vec_normalize_of
@@ -244,15 +245,26 @@ def deterministic_act(model: Any) -> Act:
 
     :param model: agent of Stable-Baselines3 or of this package, or anything with ``predict``
     :return: function of a batch of observations; the bits are those of ``model.predict(obs, deterministic=True)``. Weights
-        that change later need another call
+        that change later need another call. It raises ``ConfigError`` for a model that remembers what it saw before
     """
     policy, normalizer = plain_policy(model), vec_normalize_of(model)
     if normalizer is not None:
-        return lambda obs: model.predict(normalizer.normalize_obs(obs), deterministic=True)[0]
+        return lambda obs: _predicted(model, normalizer.normalize_obs(obs))
     if policy is None:
-        return lambda obs: model.predict(obs, deterministic=True)[0]
+        return lambda obs: _predicted(model, obs)
     snapshot = actor_snapshot(policy) if policy.device.type == "cpu" else None
     return policy_act(policy) if snapshot is None else MLPActor(snapshot)
+
+
+def _predicted(model: Any, obs: Any) -> np.ndarray:
+    actions, memory = model.predict(obs, deterministic=True)
+    if memory is not None:  # which would have to be given back at the next step, and forgotten at the end of an episode
+        raise ConfigError(
+            f"{type(model).__name__} acts by what it remembers of an episode, and these episodes are played without",
+            key="model",
+            hint="Use evaluate_policy(model, env) of Stable-Baselines3, which keeps it.",
+        )
+    return actions
 
 
 def policy_act(policy: BasePolicy) -> Act:

@@ -36,7 +36,7 @@ from sb3_dce.data.hashes import sha256_once
 from sb3_dce.data.locate import short_name
 from sb3_dce.errors import CheckpointError
 from sb3_dce.evaluation import Evaluation
-from sb3_dce.files import cannot_read, write_text
+from sb3_dce.files import cannot_read, quoted, write_text
 from sb3_dce.precision import missing_for
 
 BEGIN_ANEW = "Delete the run's folder to run it anew, or choose another one with --out."
@@ -97,7 +97,7 @@ def write_config(
     device = device or model.device
     hyperparameters = {name: plain(value) for name, value in model.hyperparameters().items()}
     origin = {
-        "command": " ".join(["sb3-dce", *sys.argv[1:]]) if Path(sys.argv[0]).name == "sb3-dce" else None,
+        "command": " ".join(["sb3-dce", *map(quoted, sys.argv[1:])]) if _is_command(Path(sys.argv[0])) else None,
         "versions": {
             "sb3_dce": sb3_dce.__version__,
             "commit": source_commit(),
@@ -119,6 +119,11 @@ def write_config(
         **(_origin_when_resumed(before, origin, model.num_timesteps) if model.num_timesteps else origin),
     }
     write_text(folder / "config.yml", yaml.safe_dump(config, sort_keys=False))
+
+
+def _is_command(program: Path) -> bool:
+    """Whether it is ``sb3-dce`` or ``python -m sb3_dce``."""
+    return program.name == "sb3-dce" or program == Path(sb3_dce.__file__).parent / "__main__.py"
 
 
 def _origin_when_resumed(before: dict[str, Any], now: dict[str, Any], n_updates: int) -> dict[str, Any]:
@@ -261,10 +266,10 @@ def progress_logs(folder: Path) -> list[tuple[int, Path]]:
     Logs of a run in the order of training; a run that goes on opens another one.
 
     :param folder: of a run
-    :return: the update after which each begins, and its file; those without a line are left out
+    :return: the update after which each begins, and its file; those without a line are left out, and copies of another name
     """
-    logs = [(int(path.stem.rpartition("_")[2]), path) for path in folder.glob("progress_*.csv") if path.stat().st_size]
-    return sorted(logs)
+    numbers = [(path.stem.removeprefix("progress_"), path) for path in folder.glob("progress_*.csv")]
+    return sorted((int(number), path) for number, path in numbers if number.isdecimal() and path.stat().st_size)
 
 
 def last_metrics(folder: Path) -> dict[str, float]:

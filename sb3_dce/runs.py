@@ -191,6 +191,7 @@ def refuse_other_run(spec: RunSpec, folder: Path) -> None:
     """
     config = read_config(folder)
     if config is None:
+        _refuse_unrecorded(spec, folder)
         return
     begun, data, settings = (config[name] for name in ("run", "dataset", "hyperparameters"))
     wanted = settings_of_run(spec)
@@ -206,12 +207,28 @@ def refuse_other_run(spec: RunSpec, folder: Path) -> None:
     if there != now:
         changes.append(f"dataset={begun.get('dataset')!r} (sha256 {there[:8]}) there, {spec.dataset!r} ({now[:8]}) now")
     if changes:
-        raise ConfigError(
-            f"the folder holds a run with other settings: {', '.join(changes)}",
-            where=str(folder),
-            path=folder,
-            hint=OTHER_FOLDER,
-        )
+        raise _other_run(changes, folder)
+
+
+def _other_run(changes: Sequence[str], folder: Path) -> ConfigError:
+    what = f"the folder holds a run with other settings: {', '.join(changes)}"
+    return ConfigError(what, where=str(folder), path=folder, hint=OTHER_FOLDER)
+
+
+def _refuse_unrecorded(spec: RunSpec, folder: Path) -> None:
+    """
+    Where ``config.yml`` has gone a result says what was run; of a model alone nobody knows, and it may be any other's. A
+    checkpoint at update 0 is what a run is to begin from.
+    """
+    done = read_result(folder)
+    if done is not None:
+        if changes := changed_settings(done["config"], settings_of_run(spec)):
+            raise _other_run(changes, folder)
+        return
+    models = [path for pattern in ("checkpoint*.zip", "model.zip") for path in folder.glob(pattern)]
+    if names := sorted(path.name for path in models if saved_timesteps(path) > 0):
+        what = f"there is no config.yml that says of which run this is: {', '.join(names)}"
+        raise ConfigError(what, where=str(folder), path=folder, hint=f"Put it back. {OTHER_FOLDER}")
 
 
 def _reached(folder: Path) -> int:

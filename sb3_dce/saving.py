@@ -141,6 +141,8 @@ class SavingMixin(OffPolicyAlgorithm):
         _refuse_not_finite(model, CheckpointError, f"{_name_of(source)} cannot be used")
         if kwargs.get("seed") not in (None, saved.get("seed")):  # the saved state of the generator would go on regardless
             model.set_random_seed(kwargs["seed"])
+        if "critic_weight_decay" in kwargs:
+            model.policy.set_critic_weight_decay()  # type: ignore[operator]  # OfflineSACPolicy has it
         if any(name in kwargs and kwargs[name] != saved.get(name) for name in CHOOSES_ROWS):
             model.forget_rows()  # type: ignore[attr-defined]  # other ones are what was asked for
         if dataset is not None:
@@ -216,7 +218,8 @@ def existing_zip(path: Path) -> Path:
     :return: the file that is there
     :raises CheckpointError: if none is
     """
-    for candidate in (path, path.with_name(path.name + ".zip")):
+    candidates = [path, path.with_name(path.name + ".zip")] if path.name else [path]  # "." and "/" are called nothing
+    for candidate in candidates:
         if candidate.is_file():
             return candidate
     what = "a folder, not a saved model" if path.is_dir() else "no such file"
@@ -289,7 +292,7 @@ def _refuse_not_finite(model: Any, error: type[SB3DCEError], what: str) -> None:
     for name, tensor in named:
         if isinstance(tensor, th.Tensor) and not bool(th.isfinite(tensor).all()):
             hint = "Go back to an earlier checkpoint; training needs a lower learning_rate, or another penalty."
-            raise error(f"{what}: {name} is not finite", key=name, hint=hint)
+            raise error(f"{what}: {name} is not finite", key=name, index=model._n_updates, hint=hint)
 
 
 def _name_of(source: Path | io.BufferedIOBase) -> str:

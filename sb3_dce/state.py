@@ -151,6 +151,14 @@ class Storage:
             for p, address in zip(self._parameters, self._moment_pointers, strict=True)
         )
 
+    def holds(self, tensor: th.Tensor) -> bool:
+        """
+        Whether a parameter or buffer is one of those stored here.
+
+        :param tensor: the module's own
+        """
+        return any(tensor is each for each in self._parameters)
+
     def move_settings(self, device: th.device) -> None:
         """
         Move the mask of the trained parameters, which only a partly frozen network has, to where the update needs it.

@@ -28,7 +28,7 @@ def steps_in_episode(ends: np.ndarray) -> np.ndarray:
     :param ends: bool per row, true at the last row of an episode
     :return: number of each row within its episode, from 0
     """
-    starts = np.concatenate([[0], np.flatnonzero(ends)[:-1] + 1])
+    starts = np.concatenate([[0], np.flatnonzero(ends[:-1]) + 1])  # the last row begins none
     first = np.zeros(len(ends), dtype=int)
     first[starts] = starts
     return np.arange(len(ends)) - np.maximum.accumulate(first)

@@ -64,8 +64,9 @@ def main() -> None:
     *sets, out = sys.argv[1:]
     (name_a, configs_a, curves_a), (name_b, configs_b, curves_b) = map(read_set, sets)
     configs = [*configs_a, *configs_b]
-    if not configs_a or not configs_b:
-        sys.exit(f"no runs in {sets[0] if not configs_a else sets[1]}")
+    for text, own in zip(sets, (configs_a, configs_b), strict=True):
+        if len(own) < 2:
+            sys.exit(f"{len(own)} run(s) in {text}: an interval needs two seeds or more in each set")
     hashes = {config["dataset"]["sha256"] for config in configs}
     lengths = {curve[-1].n_updates for curve in (*curves_a, *curves_b)}
     if len(hashes) != 1 or len(lengths) != 1:

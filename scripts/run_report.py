@@ -1,5 +1,5 @@
 """
-One Markdown page about the runs of ``sb3-dce train``: scores of every seed, and whether the critics obey the theory.
+One Markdown page about the runs of ``sb3-dce train`` with DCE: scores of every seed, and whether the critics obey the theory.
 
     python scripts/run_report.py <folder of the runs> > docs/results/<name>.md
 """
@@ -39,10 +39,14 @@ def report(folder: Path) -> str:
     :return: Markdown
     """
     runs = sorted(path.parent for path in folder.glob("*/config.yml"))
+    if not runs:
+        sys.exit(f"no runs in {folder}: give the folder of `sb3-dce train`, which has one sub-folder per seed")
     configs = [yaml.safe_load((run / "config.yml").read_text()) for run in runs]
     first, settings = configs[0], configs[0]["run"]
     dataset_id = catalogue_id(first["dataset"]["name"])
     h = first["hyperparameters"]
+    if "beta" not in h:
+        sys.exit(f"the page is about the penalty of DCE, which {settings['algo']} does not have: use `sb3-dce compare`")
     lines = [
         f"# {settings['algo']} on {dataset_id}",
         "",

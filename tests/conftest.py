@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import re
 import signal
+import site
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +21,8 @@ from hypothesis import settings
 from sb3_dce import Transitions
 from sb3_dce.data import write_hdf5
 from sb3_dce.envs import SpacesEnv
+
+pytest.register_assert_rewrite("update_tools")  # so that its checks say what differs, as those of the tests do
 
 # the same examples every time, on every machine
 settings.register_profile("fixed", derandomize=True, database=None)
@@ -75,6 +80,24 @@ def recorded_arrays(n_rows: int = N_ROWS) -> dict[str, np.ndarray]:
         obs = env.reset()[0] if terminated or truncated else following
     arrays = {key: np.asarray(values) for key, values in rows.items()}
     return {key: values.astype(np.float32) if values.dtype == np.float64 else values for key, values in arrays.items()}
+
+
+# what the package, Minari, the hub behind it and downloads read of a user's settings
+OF_THE_USER = re.compile(r"(SB3_DCE|MINARI|HF|D4RL)_|XDG_CACHE_HOME$|\w+_PROXY$", re.IGNORECASE)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def empty_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A user without data, settings, mirrors and proxies. A test that puts something into the home makes one of its own."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    with pytest.MonkeyPatch.context() as patch:
+        # matplotlib's list of fonts takes seconds to make, and packages may be installed for the user alone
+        patch.setenv("MPLCONFIGDIR", os.environ.get("MPLCONFIGDIR") or str(cache / "matplotlib"))
+        patch.setenv("PYTHONUSERBASE", site.getuserbase())
+        for name in filter(OF_THE_USER.match, list(os.environ)):
+            patch.delenv(name)
+        patch.setenv("HOME", str(tmp_path_factory.mktemp("home")))
+        yield
 
 
 @pytest.fixture(autouse=True, scope="session")

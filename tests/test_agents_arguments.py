@@ -113,6 +113,10 @@ def test_wrong_argument_is_refused_by_the_constructor(key: str, name: str, value
         make(AGENTS[key], env=spaces_env, **{name: value})
 
 
+def test_every_wrong_argument_is_one_of_some_agent() -> None:
+    assert [name for name, _ in WRONG if not any(accepts(agent, name) for agent in AGENTS.values())] == []
+
+
 def test_device_beyond_those_that_are_there_is_refused(spaces_env: SpacesEnv, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(th.cuda, "is_available", lambda: True)
     monkeypatch.setattr(th.cuda, "device_count", lambda: 1)

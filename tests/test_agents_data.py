@@ -20,7 +20,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_dce import Transitions
+from sb3_dce import OfflineBC, Transitions
 from sb3_dce.envs import SpacesEnv
 from sb3_dce.errors import CheckpointError, ConfigError, DatasetFormatError, DatasetNotFoundError
 from sb3_dce.evaluation import evaluate
@@ -307,6 +307,15 @@ def test_fresh_observation_statistics_are_taken_from_the_data(
         assert any("VecNormalize has seen 3 observations" in str(w.message) for w in caught) is bool(looks)
         assert np.allclose(env.obs_rms.mean, transitions.observations.mean(axis=0), atol=1e-4)
         assert np.allclose(env.obs_rms.var, transitions.observations.var(axis=0), rtol=1e-2)
+
+
+def test_statistics_of_many_observations_are_exact(
+    random_transitions: Callable[..., Transitions], make_point_mass: Callable[[], gym.Env]
+) -> None:
+    data, env = random_transitions(20_000), VecNormalize(DummyVecEnv([make_point_mass]), norm_reward=False)
+    OfflineBC("MlpPolicy", env, dataset=data, policy_kwargs={"net_arch": [4]}).learn(1)
+    assert np.allclose(env.obs_rms.mean, data.observations.mean(axis=0, dtype=np.float64), rtol=0.0, atol=1e-9)
+    assert np.allclose(env.obs_rms.var, data.observations.var(axis=0, dtype=np.float64), rtol=1e-8)
 
 
 def test_observations_are_not_standardised_twice(

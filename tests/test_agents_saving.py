@@ -119,11 +119,12 @@ def test_save_that_fails_halfway_leaves_the_old_file(agent: Agent, transitions: 
 
 
 def test_model_with_nan_weights_is_not_saved(agent: Agent, transitions: Transitions, tmp_path: Path) -> None:
-    model = make(agent, dataset=transitions)
+    model = make(agent, dataset=transitions).learn(2)
     with th.no_grad():
         next(model.policy.actor.parameters()).view(-1)[0] = float("nan")
-    with pytest.raises(DivergenceError, match="refusing to save: actor"):
+    with pytest.raises(DivergenceError, match="refusing to save: actor") as caught:
         model.save(tmp_path / "model.zip")
+    assert caught.value.index == 2, "the update is what is written down of a run that diverged"
     assert not (tmp_path / "model.zip").exists()
 
 
@@ -299,6 +300,21 @@ def test_random_state_of_another_kind_of_device_gives_way_to_new_numbers_not_to_
         assert not th.equal(state, th.Generator().manual_seed(3).get_state())
     runs = [weights(each.learn(2, reset_num_timesteps=False)) for each in loaded]
     assert same(*runs) and loaded[0]._n_updates == 4
+
+
+@pytest.mark.parametrize(
+    ("given", "in_force"), [({}, 0.3), ({"critic_weight_decay": 0.1}, 0.1), ({"critic_weight_decay": 0.0}, 0)]
+)
+def test_weight_decay_given_to_load_is_trained_with(
+    given: dict, in_force: float, transitions: Transitions, tmp_path: Path
+) -> None:
+    settings = {"policy_kwargs": {"net_arch": [8]}, "device": "cpu", "execution": "eager"}
+    OfflineDCE("MlpPolicy", dataset=transitions, critic_weight_decay=0.3, **settings).learn(1).save(tmp_path / "model.zip")
+    loaded = OfflineDCE.load(tmp_path / "model.zip", device="cpu", **given)
+    assert loaded.make_storages()["critic"].settings.weight_decay == loaded.critic_weight_decay == in_force
+    loaded.save(tmp_path / "again.zip")
+    again = OfflineDCE.load(tmp_path / "again.zip", device="cpu")
+    assert again.make_storages()["critic"].settings.weight_decay == in_force
 
 
 @pytest.mark.parametrize(

@@ -17,10 +17,8 @@ from sb3_dce.hyperparams import load_row
 
 @pytest.fixture(autouse=True)
 def empty_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A machine without datasets, but for those of the package."""
+    """A home of the test's own, without datasets."""
     monkeypatch.setenv("HOME", str(tmp_path))
-    for variable in ("SB3_DCE_DATASETS", "XDG_CACHE_HOME", "D4RL_DATASET_DIR"):
-        monkeypatch.delenv(variable, raising=False)
     return tmp_path
 
 

@@ -18,7 +18,7 @@ from sb3_dce.data import Transitions, resolve
 from sb3_dce.data.catalog import normalized_score
 from sb3_dce.errors import CheckpointError, ConfigError
 from sb3_dce.evaluation import Evaluation, write_evaluations
-from sb3_dce.run_files import RunSpec
+from sb3_dce.run_files import RunSpec, write_divergence
 from sb3_dce.student import mean_interval
 
 TINY = "halfcheetah-tiny-sb3"
@@ -75,6 +75,11 @@ def test_report_is_made_of_all_complete_runs_and_trains_nothing(tmp_path: Path, 
     begun["run"]["n_updates"] = 8
     longer.write_text(yaml.safe_dump(begun))
     assert [(row.n_seeds, row.n_updates) for row in report(TINY, ["bc"], tmp_path, quiet)] == [(2, 4)]
+    write_divergence(tmp_path / "offline_bc" / "seed_0", 6, "metrics not finite")  # it is one of 8 updates that diverged
+    shutil.copytree(tmp_path / "offline_bc" / "seed_1", tmp_path / "offline_bc" / "seed_4")
+    assert [(row.n_seeds, row.n_updates) for row in report(TINY, ["bc"], tmp_path, Console(width=200))] == [(2, 4)]
+    shown = capsys.readouterr().out
+    assert "left out: 1 of offline_bc with 8 updates" in shown and "Diverged" not in shown
     config["dataset"]["sha256"] = "0" * 64
     (other / "config.yml").write_text(yaml.safe_dump(config))
     with pytest.raises(ConfigError, match="trained on another file"):

@@ -11,8 +11,10 @@ import pytest
 from commands import sb3_dce
 from dataset_files import base_arrays
 
-from sb3_dce.data import DatasetCard, Transitions, compare_datasets
+from sb3_dce.data import DatasetCard, Transitions, compare_datasets, resolve
 from sb3_dce.errors import DatasetFormatError, DatasetNotFoundError, DatasetSemanticsError
+
+CARDS = Path(__file__).parents[1] / "docs" / "results" / "cards"
 
 
 def made(
@@ -149,6 +151,15 @@ def test_a_missing_card_is_not_called_damaged(tmp_path: Path) -> None:
         DatasetCard.read(tmp_path / "nothing.json")
 
 
+@pytest.mark.skipif(not CARDS.is_dir(), reason="not a checkout")
+def test_cards_of_the_results_are_read() -> None:
+    paths = sorted(CARDS.glob("*.json"))
+    assert len(paths) > 20
+    for path in paths:
+        card = DatasetCard.read(path)
+        assert card.id == path.stem == resolve(card.id).id and compare_datasets(card, card).verdict == "identical", path
+
+
 def test_the_command_compares_files_and_cards(tmp_path: Path) -> None:
     made(0).to_hdf5(tmp_path / "mine.hdf5")
     made(1).to_hdf5(tmp_path / "again.hdf5")
@@ -163,3 +174,8 @@ def test_the_command_compares_files_and_cards(tmp_path: Path) -> None:
     other = sb3_dce("datasets", "compare", card, str(tmp_path / "other.hdf5"))
     assert other.code == 1 and "mean of action 0" in other.stdout and "different: 2 of 10" in other.stdout
     assert sb3_dce("datasets", "compare", mine, str(tmp_path / "no.json")).code == 2
+    before = (tmp_path / "mine.hdf5").read_bytes()
+    refused = sb3_dce("datasets", "info", "--card", mine, str(tmp_path / "again.hdf5"))
+    assert refused.code == 2 and "mine.hdf5: this file exists and is no card" in refused.stderr
+    assert (tmp_path / "mine.hdf5").read_bytes() == before
+    assert sb3_dce("datasets", "info", str(tmp_path / "again.hdf5"), "--card", card).code == 0, "a card is replaced"

@@ -65,6 +65,11 @@ def rows(start: int, stop: int) -> Callable[[Arrays], None]:
     return lambda arrays: arrays.update({key: array[start:stop] for key, array in arrays.items()})
 
 
+def two_rows_without_next(arrays: Arrays) -> None:
+    rows(0, 2)(arrays)
+    without("next_observations")(arrays)
+
+
 def compound(arrays: Arrays) -> None:
     arrays["rewards"] = np.zeros(N_ROWS, dtype=[("value", "f4"), ("weight", "f4")])
 
@@ -107,6 +112,7 @@ FAULTS: list[tuple[str, Callable[[Arrays], object], type[DatasetError], tuple[st
     ("D-23b", put("timeouts", 9, 2, "u1"), FORMAT, ("timeouts", "row 9 has 2")),
     ("D-24", rows(0, 0), SEMANTICS, ("empty",)),
     ("D-25", rows(0, 1), SEMANTICS, ("1 rows, 1 usable",)),
+    ("D-25b", two_rows_without_next, SEMANTICS, ("2 rows, 1 usable", "at least 2 are needed", "next_observations")),
     (
         "D-26",
         put("observations", (5, 2), np.nan),
@@ -125,7 +131,7 @@ FAULTS: list[tuple[str, Callable[[Arrays], object], type[DatasetError], tuple[st
     ("D-36", put("next_observations", (79, 0), np.inf), SEMANTICS, ("next_observations has 1", "(79, 0)")),
     ("D-37", put("next_observations", (5, 0), -np.inf), SEMANTICS, ("next_observations has 1",)),
     ("D-39", put("actions", (3, 1), 55.0), SEMANTICS, ("1 action entries", "..55", "action_low=", "clip_actions=True")),
-    ("D-45", shift_next_observations, SEMANTICS, ("observations[i + 2]", "shift of +1")),
+    ("D-45", shift_next_observations, SEMANTICS, ("observations[i + 2]", "shift of +1", "take turns", "array[i::2]")),
     ("rewards (N,2)", shaped("rewards", N_ROWS, 2), FORMAT, ("rewards has shape (200, 2)",)),
     ("scalar", shaped("rewards"), FORMAT, ("rewards has shape ()",)),
     ("float64 beyond float32", put("rewards", 4, 1e300, "f8"), SEMANTICS, ("1e+300 at row 4, column 0",)),
@@ -338,6 +344,14 @@ def test_widths_of_both_kinds_of_observations_must_agree_without_a_catalogue() -
         Transitions.from_arrays(**arrays)
 
 
+@pytest.mark.skipif(np.dtype("g").itemsize == 8, reason="such a float is a double on this machine")
+def test_floats_wider_than_double_are_refused() -> None:
+    arrays = base_arrays()
+    put("rewards", 4, np.longdouble("1e400"), "g")(arrays)  # type: ignore[arg-type]
+    with pytest.raises(DatasetFormatError, match=f"rewards has type {np.dtype('g')}. Store float32"):
+        Transitions.from_arrays(**arrays)
+
+
 def test_vector_of_actions_is_one_entry_wide() -> None:
     arrays = base_arrays()
     arrays["actions"] = arrays["actions"][:, 0]
@@ -352,6 +366,20 @@ def test_shift_is_found_wherever_the_file_begins(start: int) -> None:
         shifted = arrays | {"next_observations": np.roll(arrays["next_observations"], -steps, axis=0)}
         with pytest.raises(DatasetSemanticsError, match=re.escape(f"a shift of {steps:+d} rows")):
             Transitions.from_arrays(**{key: array[start:] for key, array in shifted.items()})
+
+
+@pytest.mark.parametrize("n_envs", [2, 3])
+def test_environments_that_take_turns_are_no_shift(n_envs: int) -> None:
+    turns = {key: np.repeat(array, n_envs, axis=0) for key, array in base_arrays().items()}
+    for key in ("observations", "next_observations"):
+        turns[key] += np.tile(np.arange(n_envs, dtype=np.float32), N_ROWS)[:, None]
+    with pytest.warns(DatasetWarning, match=f"{n_envs} environments take turns"):
+        transitions = Transitions.from_arrays(**turns)
+    assert np.array_equal(transitions.next_observations, turns["next_observations"])
+    unmarked = turns | {key: np.zeros(len(turns[key]), dtype=bool) for key in ("terminals", "timeouts")}
+    with pytest.raises(DatasetSemanticsError, match=rf"Shift the array back; or.*array\[i::{n_envs}\]") as caught:
+        Transitions.from_arrays(**unmarked)
+    assert "leave it out" not in str(caught.value)
 
 
 def as_file(path: Path) -> Path:

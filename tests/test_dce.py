@@ -19,16 +19,16 @@ DCE = AGENTS["DCE"]
 
 
 @pytest.mark.parametrize(
-    "settings",
+    ("settings", "message"),
     [
-        {"n_penalty_actions": 2, "penalty_action_source": "dataset"},
-        {"use_v": False, "use_target_v": True},
-        {"use_v": False, "penalty_form": "hinge"},
+        ({"n_penalty_actions": 2, "penalty_action_source": "dataset"}, "would repeat one action.*Use n_penalty_actions=1"),
+        ({"use_v": False, "use_target_v": True}, "use_target_v=True.*need the state-value network.*Set use_v=True"),
+        ({"use_v": False, "penalty_form": "hinge"}, "penalty_form='hinge' need the state-value network.*Set use_v=True"),
     ],
     ids=str,
 )
-def test_impossible_combination_is_refused(spaces_env: SpacesEnv, settings: dict[str, Any]) -> None:
-    with pytest.raises(ConfigError):
+def test_impossible_combination_is_refused(spaces_env: SpacesEnv, settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         make(DCE, env=spaces_env, **settings)
 
 

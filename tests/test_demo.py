@@ -46,6 +46,30 @@ def test_fresh_deletes_what_a_demo_wrote_and_nothing_else(tmp_path: Path) -> Non
     assert {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("*") if p.is_file()} == set(other)
 
 
+def test_run_that_is_half_deleted_is_still_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = {"algo": "dce", "seed": 0, "dataset": demo.DATASET}
+    for name in ("model.zip", "config.yml", "result.json", "a", "z"):
+        text = yaml.safe_dump({"run": run, "dataset": {}, "hyperparameters": {}}) if name == "config.yml" else ""
+        write_text(tmp_path / "dce_0" / name, text)
+    deleted: list[str] = []
+    monkeypatch.setattr(Path, "unlink", lambda path, **_: deleted.append(path.name))
+    monkeypatch.setattr(demo.shutil, "rmtree", lambda *_, **__: None)
+    demo._delete_demo(tmp_path)
+    inner = [name for name in deleted if (tmp_path / "dce_0" / name).exists() and name != ".lock"]
+    assert len(inner) == 5 and inner[-1] == "config.yml"
+
+
+@pytest.mark.parametrize("fresh", [False, True])
+def test_files_of_another_program_are_not_replaced(fresh: bool, tmp_path: Path) -> None:
+    for name, text in {"results.json": '{"accuracy": 0.9}', "learning_curve.png": "mine"}.items():
+        (tmp_path / name).write_text(text)
+        outcome = sb3_dce("demo", "--out", str(tmp_path), *(["--fresh"] if fresh else []))
+        assert outcome.code == 2 and f"{name}: a demo would replace this file" in outcome.stderr
+        assert "--out" in outcome.stderr
+        assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, text)]
+        (tmp_path / name).unlink()
+
+
 def test_simulator_that_is_missing_is_named_before_anything_is_deleted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -162,6 +162,10 @@ def episode(n: int, terminated: bool = False, **more: Any) -> dict[str, Any]:
     }
 
 
+def following(width: int) -> dict[str, Any]:
+    return episode(3) | {"observations": np.ones((3, 2)), "next_observations": np.ones((3, width))}
+
+
 @pytest.mark.parametrize("kind", ["dictionaries", "objects", "dataset"])
 def test_a_list_of_episodes_is_a_dataset(kind: str) -> None:
     episodes: list[Any] = [episode(5), episode(3, terminated=True), episode(4)]
@@ -193,6 +197,12 @@ def test_true_ends_of_a_list_of_episodes_go_by_many_names(marks: dict[str, Any],
     assert data.terminals.tolist() == [0, 0, 1, 0, 0, 1] and data.info.n_timeouts == 0
 
 
+def test_rewards_and_flags_of_an_episode_may_be_columns() -> None:
+    columns = {key: episode(3, terminated=True)[key].reshape(-1, 1) for key in ("rewards", "terminations")}
+    data = load_dataset([episode(5), episode(3) | columns])
+    assert data.rewards.tolist() == [1.0] * 8 and data.terminals.tolist() == [0] * 7 + [1]
+
+
 @pytest.mark.parametrize("name", ["done", "dones"])
 def test_ends_that_may_be_either_are_asked_about(name: str) -> None:
     plain = {key: value for key, value in episode(3).items() if key != "terminations"}
@@ -217,6 +227,10 @@ def test_episodes_without_the_last_observation_lose_their_last_step() -> None:
         ([{**episode(3), "observations": {"a": np.ones(4)}}], "episode 0 are in parts"),
         ([episode(3), {**episode(3), "observations": np.ones((4, 3))}], "observations of episode 1 have width 3, those of"),
         ([{**episode(3), "actions": 1.0}], r"actions of episode 0 have shape \(\)"),
+        ([{"observations": [1.0, 2.0], "actions": [0.5], "rewards": 1.0}], r"rewards .* have shape \(\).*A single step\?"),
+        ([episode(3), {**episode(3), "rewards": np.ones((3, 2))}], r"rewards of episode 1 have shape \(3, 2\)"),
+        ([episode(3), {**episode(3), "terminations": np.zeros((3, 2))}], r"terminals of episode 1 have shape \(3, 2\)"),
+        ([following(2), following(3)], "next_observations of episode 1 have width 3, those of episode 0 2"),
         ([{**episode(3), "actions": [[1.0], [2.0, 3.0], [4.0]]}], r"episode 0: actions is no array .*one row per step"),
         ([{**episode(3), "terminations": np.full(3, np.nan)}], "episode 0, key terminals: flags must be 0/1"),
     ],

@@ -107,17 +107,29 @@ def test_what_goes_wrong_is_said(pool: EvaluationPool, rollouts: Rollouts) -> No
     assert pool.submit(model, rollouts, 0).result() == rollouts.play(deterministic_act(model), 0), "the pool goes on"
 
 
+@pytest.mark.skipif(os.name == "nt", reason="no such signal")
+def test_sigterm_to_all_of_the_group_loses_no_evaluation(pool: EvaluationPool, rollouts: Rollouts) -> None:
+    model = agents()[0]
+    expected = pool.submit(model, rollouts, 0).result()
+    assert pool._executor is not None
+    pending = pool.submit(model, rollouts, 0)
+    for pid in pool._executor._processes:
+        os.kill(pid, signal.SIGTERM)
+    assert pending.result() == pool.submit(model, rollouts, 0).result() == expected
+
+
 @pytest.mark.slow
 def test_a_killed_worker_is_said_and_the_next_evaluation_starts_others(rollouts: Rollouts) -> None:
-    model = agents()[0]
-    with EvaluationPool(1) as pool:
-        expected = pool.submit(model, rollouts, 0).result()
+    model, before = agents()[0], set(mp.active_children())
+    with EvaluationPool(2) as pool:
+        expected = pool.submit(model, rollouts, 0, parts=2).result()
         assert pool._executor is not None
-        for pid, worker in list(pool._executor._processes.items()):
-            os.kill(pid, signal.SIGKILL)
-            worker.join()
+        pid, worker = next(iter(pool._executor._processes.items()))
+        os.kill(pid, signal.SIGKILL)
+        worker.join()
         with pytest.raises(EvaluationFailedError, match=r"ended unexpectedly.*__main__.*take fewer workers"):
             pool.submit(model, rollouts, 0).result()
+        assert set(mp.active_children()) <= before, "the other worker has ended, too"
         pool.close()
         assert pool.submit(model, rollouts, 0).result() == expected
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import warnings
-from collections.abc import Iterator
+import weakref
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
@@ -44,13 +46,16 @@ def test_long_runs_are_compiled_on_a_processor() -> None:
 
 
 @pytest.mark.parametrize("execution", ["compile", "cudagraph"])
-def test_without_a_compiler_updates_run_eager(execution: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_compiler_updates_are_not_compiled(execution: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shutil.which", lambda name: None)
     with pytest.warns(SB3DCEWarning, match=f"{execution}.* needs a C"):
         assert choose_execution(execution, 10**6, CPU) == "eager"
+    with pytest.warns(SB3DCEWarning, match="cudagraph.* needs a C.*: capturing the update as it is"):
+        assert choose_execution("cudagraph", 10**6, CUDA) == "cudagraph"
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert choose_execution("auto", 10**6, CPU) == "eager"
+        assert choose_execution("auto", 10**6, CUDA) == "cudagraph"
 
 
 @needs_compiler
@@ -68,6 +73,43 @@ def test_failing_compiler_is_no_reason_to_stop(transitions: Transitions, monkeyp
         broken_model.learn(3)
     assert len([w for w in caught if "compiling" in str(w.message)]) == 1
     assert largest_difference(all_tensors(eager.learn(3)), all_tensors(broken_model)) == 0.0
+    assert not broken_model._engine.is_compiled
+
+
+@pytest.fixture
+def captured_on_the_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stands in for CUDA graphs: what they do is for ``test_gpu.py``, which of them there are is not."""
+
+    class Step(CapturedStep):
+        is_captured = False
+
+        def __init__(self, step: Any, state: Any, draw: Any, coef: Any, metrics: Any, generator: Any = None) -> None:
+            self._step, self._state, self._draw, self._coef = step, state, draw, dict(coef)
+            self._metrics, self._generator = metrics, generator
+
+        def replay(self) -> None:
+            self._run()
+            self._metrics.count(self._names)
+
+    monkeypatch.setattr("sb3_dce.execution.CapturedStep", Step)
+    monkeypatch.setattr("sb3_dce.base.choose_execution", lambda *_: "cudagraph")
+    monkeypatch.setattr("sb3_dce.execution._has_compiler", lambda: False)
+
+
+@pytest.mark.usefixtures("captured_on_the_processor")
+def test_captured_updates_of_earlier_data_are_released(random_transitions: Callable[..., Transitions]) -> None:
+    kwargs = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 8, "seed": 0, "device": "cpu"}
+    model = OfflineBC("MlpPolicy", dataset=random_transitions(100), **kwargs)
+    for batch_size in (8, 12, 8):
+        model.train(2, batch_size)
+    captured = model._engine._captured
+    assert len(captured) == 2, "both batch sizes stay"
+    first = weakref.ref(next(iter(captured.values())))
+    model.set_dataset(random_transitions(60))
+    model.train(2, 8)
+    gc.collect()
+    assert len(captured) == 1 and first() is None
+    assert not model._engine.is_compiled, "there was no compiler"
 
 
 def test_metric_sums_average_over_the_updates_that_had_the_metric() -> None:
@@ -251,6 +293,25 @@ def test_rounding_holds_in_compiled_updates(transitions: Transitions, monkeypatc
     apart = largest_difference(params["plain"], params["eager"])
     assert apart > 1e-5
     assert largest_difference(params["compiled"], params["eager"]) < apart / 3
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_a_compiled_update_follows_the_precision(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_dce.precision.missing_for", lambda precision, device: None)
+    monkeypatch.setattr("sb3_dce.precision._rounds_itself", lambda: False)
+    kwargs = {"dataset": transitions, "policy_kwargs": {"net_arch": [32, 32]}, "seed": 0, "device": "cpu"}
+    models = {name: OfflineBC("MlpPolicy", execution=name, **kwargs) for name in ("eager", "compile")}
+    plain = OfflineBC("MlpPolicy", execution="eager", **kwargs)
+    for precision, apart in (("float32", False), ("bf16-matmul", True), ("float32", True)):
+        for model in models.values():
+            model.precision = precision
+            model.train(3, 64)
+        plain.train(3, 64)
+        eager, compiled = map(all_tensors, models.values())
+        rounded = largest_difference(all_tensors(plain), eager)
+        assert (rounded > 1e-5) == apart
+        assert largest_difference(eager, compiled) < (rounded / 3 if apart else 1e-6)
 
 
 @needs_compiler

@@ -6,6 +6,7 @@ import errno
 import os
 import pickle
 import stat
+import struct
 import subprocess
 import sys
 import zipfile
@@ -93,6 +94,7 @@ HOSTILE: list[tuple[str, Callable[[Path], None], tuple[str, ...]]] = [
     ("D-55", replace_rewards(zeros(10**9 * 10 // 4, chunks=(2**20,), compression="gzip")), ("stored", "ratio")),
     ("D-55b", replace_rewards(zeros(2 * 10**9 // 4, chunks=(2**20,), compression="gzip")), ("stores", "ratio", "beyond 200")),
     ("huge chunk", replace_rewards(zeros(N_ROWS, chunks=(2**29,), maxshape=(None,), compression="gzip")), ("2,147,483,648",)),
+    ("many chunks", replace_rewards(zeros(2**22 + 1, chunks=(1,))), ("4,194,305 chunks, the limit is", "larger chunks")),
     ("D-57", replace_rewards(unknown_filter), ("filter 305", "Rewrite with gzip")),
 ]
 
@@ -156,6 +158,21 @@ def test_flipped_byte_is_noticed_in_our_own_files(tmp_path: Path) -> None:
     content[offset + 100] ^= 1
     path.write_bytes(content)
     with pytest.raises(DatasetIntegrityError, match="key observations: damaged"):
+        Transitions.from_hdf5(path)
+
+
+def test_chunk_that_reading_would_not_find_is_missing(tmp_path: Path) -> None:
+    path = write_plain(tmp_path / "d.hdf5", base_arrays())
+    with h5py.File(path, "a") as file:
+        rewards = file["rewards"][:]
+        del file["rewards"]
+        file.create_dataset("rewards", data=rewards, chunks=(20,))
+    assert np.array_equal(Transitions.from_hdf5(path).rewards, rewards)
+    # an entry of the index: bytes, filters left out, first row, first byte of a number
+    entry, other = (struct.pack("<IIQQ", 80, 0, start, 0) for start in (100, 80))
+    assert path.read_bytes().count(entry) == 1
+    path.write_bytes(path.read_bytes().replace(entry, other))
+    with pytest.raises(DatasetIntegrityError, match="rewards: 9 of 10 chunks are stored"):
         Transitions.from_hdf5(path)
 
 

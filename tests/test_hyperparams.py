@@ -215,7 +215,7 @@ def test_short_names_are_completed_and_others_left_alone() -> None:
 
 
 def test_algorithm_name_is_not_a_path() -> None:
-    with pytest.raises(ConfigError):
+    with pytest.raises(ConfigError, match=r"for algorithm '\.\./zoo_hyperparams/dce'\. Known: cql_eq18, dce"):
         hyperparams.load_row("../zoo_hyperparams/dce", "pen-human-v0")
 
 

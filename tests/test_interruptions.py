@@ -26,6 +26,7 @@ import pytest
 import yaml
 from commands import sb3_dce
 from rich.console import Console
+from stable_baselines3.common.logger import CSVOutputFormat
 from update_tools import all_tensors, largest_difference
 
 from sb3_dce import OfflineDCE, OfflineIQL, configuration, launch
@@ -34,7 +35,15 @@ from sb3_dce.errors import CheckpointError, ConfigError
 from sb3_dce.evaluation import Evaluation, read_evaluations, write_evaluations
 from sb3_dce.experiments import results
 from sb3_dce.launch import RunFailedError, _Workers, train_one
-from sb3_dce.run_files import RunSpec, last_metrics, read_config, read_result, seconds_before, write_divergence
+from sb3_dce.run_files import (
+    RunSpec,
+    last_metrics,
+    progress_logs,
+    read_config,
+    read_result,
+    seconds_before,
+    write_divergence,
+)
 from sb3_dce.runs import Progress, StoppedError, check_before_running, run
 from sb3_dce.saving import saved_timesteps
 
@@ -178,6 +187,24 @@ def test_unexpected_error_of_a_run_is_one_line_and_a_report(tmp_path: Path, monk
     assert "Traceback" not in str(caught.value) and "Traceback" in (tmp_path / "error.txt").read_text()
 
 
+def test_full_disk_is_said_and_no_mistake_of_the_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(CSVOutputFormat, "write", full)
+    with pytest.raises(CheckpointError, match=r"cannot write: No space left on device.*free space"):
+        train_one(spec(tmp_path, 10), lambda progress: None)
+    assert not (tmp_path / "error.txt").exists()
+
+
+def test_unexpected_error_is_said_where_its_report_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "error.txt").mkdir()
+    monkeypatch.setattr("sb3_dce.launch.runs.run", lambda *_: 1 / 0)
+    with pytest.raises(RunFailedError, match="ZeroDivisionError") as caught:
+        train_one(spec(tmp_path, 10), lambda progress: None)
+    assert "error.txt" not in str(caught.value), "there is none"
+
+
 def test_second_ctrl_c_does_not_wait(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     begun: Future[None] = Future()
     begun.set_running_or_notify_cancel()
@@ -185,6 +212,38 @@ def test_second_ctrl_c_does_not_wait(monkeypatch: pytest.MonkeyPatch, capsys: py
     monkeypatch.setattr("sb3_dce.launch.wait", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     launch._save_and_end([begun], SimpleNamespace(save_and_end=lambda: asked.append(True)), Console(width=200))
     assert asked and "goes on from the last checkpoints" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("left", ["model.zip", "checkpoint.zip", "checkpoint_10.zip"])
+def test_model_of_nobody_knows_which_run_is_not_gone_on_with(left: str, tmp_path: Path) -> None:
+    run(spec(tmp_path, 10))
+    (tmp_path / "config.yml").unlink()
+    assert run(spec(tmp_path, 10))["n_updates"] == 10, "its result says which run it is"
+    with pytest.raises(ConfigError, match=r"other settings: overrides=.*'beta': 9\.0"):
+        run(spec(tmp_path, 10, beta=9.0))
+    with pytest.raises(ConfigError, match="other settings: n_updates=10 there, 20 now"):
+        run(spec(tmp_path, 20))
+    (tmp_path / "result.json").unlink()
+    (tmp_path / "model.zip").rename(tmp_path / left)
+    with pytest.raises(ConfigError, match=f"no config.yml that says of which run this is: {left}.*another folder"):
+        run(spec(tmp_path, 10))
+
+
+def test_command_of_a_run_is_known_however_it_was_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for program in ("/usr/bin/sb3-dce", str(Path(launch.__file__).parent / "__main__.py"), "mine/__main__.py"):
+        monkeypatch.setattr("sys.argv", [program, "train", "a b"])
+        run(spec(tmp_path / program.replace("/", "_"), 10))
+    commands = [yaml.safe_load(path.read_text())["command"] for path in sorted(tmp_path.glob("*/config.yml"))]
+    quoted = '"a b"' if os.name == "nt" else "'a b'"
+    assert sorted(map(str, commands)) == ["None", f"sb3-dce train {quoted}", f"sb3-dce train {quoted}"]
+
+
+def test_copy_of_a_log_under_another_name_is_no_log(tmp_path: Path) -> None:
+    with pytest.raises(StoppedError):
+        run(spec(tmp_path, 30), stop=after(12))
+    shutil.copy(tmp_path / "progress_0.csv", tmp_path / "progress_0 (conflicted copy).csv")
+    assert run(spec(tmp_path, 30))["n_updates"] == 30
+    assert [first for first, _ in progress_logs(tmp_path)] == [0, 12]
 
 
 def test_damaged_checkpoint_says_what_to_delete(tmp_path: Path) -> None:
@@ -285,11 +344,14 @@ def test_process_that_is_killed_in_the_middle_of_a_message_is_replaced(
 
 
 @pytest.fixture
-def begin() -> Iterator[Callable[[list[str], Path, str], subprocess.Popen[str]]]:
-    """Starts a command in a group of processes of its own, and waits for files of a pattern in its folder."""
+def begin() -> Iterator[Callable[[list[str], Path, Callable[[int], object] | str], subprocess.Popen[str]]]:
+    """
+    Starts a command in a group of processes of its own, and waits for files of a pattern in its folder, or until what is
+    asked about its number is true.
+    """
     started: list[subprocess.Popen[str]] = []
 
-    def start(command: list[str], folder: Path, ready: str) -> subprocess.Popen[str]:
+    def start(command: list[str], folder: Path, ready: Callable[[int], object] | str) -> subprocess.Popen[str]:
         # a test run in the background of a shell passes on that Ctrl-C is ignored
         code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from sb3_dce.cli import main; main()"
         arguments = [sys.executable, "-c", code, *command, *FAST, "--out", str(folder)]
@@ -297,7 +359,8 @@ def begin() -> Iterator[Callable[[list[str], Path, str], subprocess.Popen[str]]]
         process = subprocess.Popen(arguments, start_new_session=True, **pipes)  # type: ignore[call-overload]
         started.append(process)
         deadline = time.monotonic() + 150
-        while not list(folder.rglob(ready)) and time.monotonic() < deadline and process.poll() is None:
+        is_ready = ready if callable(ready) else lambda pid: list(folder.rglob(ready))
+        while not is_ready(process.pid) and time.monotonic() < deadline and process.poll() is None:
             time.sleep(0.02)
         return process
 
@@ -339,6 +402,39 @@ def children_of(pid: int) -> list[int]:
         if parent == pid and b"spawn_main" in command:
             found.append(int(stat.parent.name))
     return sorted(found)
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds the processes in /proc")
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_command_that_is_interrupted_while_its_processes_start_has_lost_nothing(
+    sent: signal.Signals, tmp_path: Path, begin: Any
+) -> None:
+    process = begin(["train", TINY, "--updates", "1000000", "--eval-freq", "200000"], tmp_path, children_of)
+    os.killpg(process.pid, sent)
+    stdout, stderr = process.communicate(timeout=100)
+    assert process.returncode == 128 + sent and stderr == ""
+    assert "failed" not in stdout and "The same command goes on from there." in stdout
+    assert not list(tmp_path.rglob("*.zip")), "nothing had begun"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no such signals")
+def test_interrupted_command_saves_though_nobody_reads_what_it_says(tmp_path: Path, begin: Any) -> None:
+    command = ["train", TINY, "--updates", "1000000", "--eval-freq", "200000", "--eval-episodes", "1"]
+    process = begin(command, tmp_path, "progress_0.csv")
+    process.stdout.close()  # a terminal sends Ctrl-C to the `tee` behind the pipe, too
+    os.killpg(process.pid, signal.SIGINT)
+    assert process.wait(timeout=100) == 128 + signal.SIGINT
+    assert 0 < saved_timesteps(tmp_path / "seed_0" / "checkpoint.zip") < 1_000_000
+
+
+def test_command_whose_reader_has_gone_trains_all_its_runs(tmp_path: Path, begin: Any) -> None:
+    command = ["train", TINY, "--updates", "20", "--eval-freq", "10", "--eval-episodes", "1", "--workers", "1", "--seeds", "2"]
+    process = begin(command, tmp_path, lambda pid: True)
+    assert process.stdout.readline().startswith("dce on")
+    process.stdout.close()  # before the first evaluation, as `| head -1` does
+    assert process.wait(timeout=100) == 0 and process.stderr.read() == ""
+    assert [read_result(tmp_path / f"seed_{seed}")["n_updates"] for seed in range(2)] == [20, 20]  # type: ignore[index]
+    assert (tmp_path / "learning_curve.png").is_file()
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds the processes in /proc")

@@ -315,6 +315,8 @@ def test_parquet_that_declares_too_much_is_refused_at_little_cost(confined: Read
 def test_pipe_is_not_waited_for(confined: Read, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "endless.hdf5")
     assert_refused_cheaply(confined(tmp_path / "endless.hdf5"), FORMAT, ("a pipe or a device",))
+    assert_refused_cheaply(confined(tmp_path / "endless.hdf5", cache=True), FORMAT, ("a pipe or a device",))
+    assert_refused_cheaply(confined(tmp_path / "endless.hdf5", sha256="0" * 64), FORMAT, ("not a file",))
 
 
 def test_the_confinement_measures_memory(confined: Read, tmp_path: Path) -> None:

@@ -653,8 +653,8 @@ def test_flipped_bytes_never_leave_the_family_of_errors(root: Path, flips: int) 
 
 def command(*arguments: str, root: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     code = "import sys; from sb3_dce import cli; sys.argv[0] = 'sb3-dce'; cli.main()"
-    clean = {key: value for key, value in os.environ.items() if key not in ("HF_ENDPOINT", "MINARI_REMOTE")}
-    env = {**clean, "MINARI_DATASETS_PATH": str(root), "HF_HOME": str(root.parent / "hub"), "COLUMNS": "300", **environment}
+    own = {"MINARI_DATASETS_PATH": str(root), "HF_HOME": str(root.parent / "hub"), "COLUMNS": "300"}
+    env = {**os.environ, **own, **environment}
     return subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, env=env, timeout=120)
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 import pickle
+import struct
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -320,6 +323,11 @@ def damaged(path: Path, **changes: Any) -> None:
     np.savez(path, **{**arrays, **changes})
 
 
+def normalized(**changes: np.ndarray) -> dict[str, np.ndarray]:
+    """Members of a policy of five observations that standardises them."""
+    return {"obs_mean": np.zeros(5), "obs_var": np.ones(5), "norm_eps": np.array(1e-8), "clip_obs": np.array(1.0)} | changes
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -328,8 +336,12 @@ def damaged(path: Path, **changes: Any) -> None:
         ({"b0": np.array([None] * 8)}, "allow_pickle"),
         ({"meta": np.frombuffer(b"{}", np.uint8)}, "activation"),
         ({"logstd_w": np.zeros((2, 3), np.float32)}, "layer 1"),
+        ({"log_std": np.zeros(3, np.float32)}, r"log_std has shape \(3,\), wanted is \(2,\)"),
+        (normalized(obs_mean=np.zeros(4)), r"obs_mean has shape \(4,\), wanted is \(5,\)"),
+        (normalized(obs_var=np.ones(1)), r"obs_var has shape \(1,\), wanted is \(5,\)"),
+        (normalized(obs_var=np.full(5, -1.0)), "obs_var plus norm_eps must be positive"),
     ],
-    ids=["shape", "nan", "pickle", "meta", "std"],
+    ids=["shape", "nan", "pickle", "meta", "std", "vector", "mean", "variance", "negative"],
 )
 def test_damaged_npz_is_refused(sac_npz: Path, changes: dict[str, Any], message: str) -> None:
     damaged(sac_npz, **changes)
@@ -337,10 +349,20 @@ def test_damaged_npz_is_refused(sac_npz: Path, changes: dict[str, Any], message:
         read_npz_policy(sac_npz)
 
 
+def with_broken_header() -> bytes:
+    """An archive with an array whose header ends in the middle of an expression."""
+    member, archive = b"\x93NUMPY\x01\x00" + struct.pack("<H", 1) + b"(", io.BytesIO()
+    with zipfile.ZipFile(archive, "w") as file:
+        file.writestr("w0.npy", member)
+    return archive.getvalue()
+
+
 def test_files_that_are_no_policies_are_refused(tmp_path: Path, zips: dict[str, Path]) -> None:
     (tmp_path / "text.zip").write_text("hello")
     (tmp_path / "text.npz").write_text("hello")
-    for name in ("text.zip", "text.npz", "missing.zip", "missing.npz"):
+    (tmp_path / "empty.npz").touch()
+    (tmp_path / "header.npz").write_bytes(with_broken_header())
+    for name in ("text.zip", "text.npz", "empty.npz", "header.npz", "missing.zip", "missing.npz"):
         with pytest.raises(CheckpointError, match=name):
             load_policy(str(tmp_path / name), OBSERVATION_SPACE, ACTION_SPACE)
     with pytest.raises(ConfigError, match=r"'random' or a \.zip or \.npz file"):

@@ -7,17 +7,18 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch as th
 
 import sb3_dce
-from sb3_dce import OfflineDCE, execution, load_dataset
+from sb3_dce import OfflineDCE, execution, load_dataset, processes
 from sb3_dce.data import available, find_file, locate, memory
 from sb3_dce.errors import ConfigError, DatasetNotFoundError, DatasetWarning, SB3DCEWarning
 from sb3_dce.evaluation import evaluate
-from sb3_dce.processes import usable_cores
+from sb3_dce.processes import prepare_worker, usable_cores, worker_pool
 from sb3_dce.rollouts import make_rollouts
 
 TINY = "halfcheetah-tiny-sb3"
@@ -48,8 +49,6 @@ print(OfflineDCE.load_dataset({TINY!r}).beta_rate)
 
 def test_no_home_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(Path, "expanduser", _no_home)
-    for name in ("XDG_CACHE_HOME", "SB3_DCE_DATASETS", "D4RL_DATASET_DIR"):
-        monkeypatch.delenv(name, raising=False)
     assert locate.search_folders() == [] and find_file(TINY)[0].is_file()
     assert len(load_dataset(TINY)) > 0
     with pytest.raises(ConfigError, match=r"no home folder.*\$XDG_CACHE_HOME"):
@@ -64,7 +63,6 @@ def test_no_home_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None
 
 def test_rows_are_kept_without_a_home_folder_where_there_is_a_place(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(Path, "expanduser", _no_home)
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     copy = shutil.copy(find_file(TINY)[0], tmp_path / "mine.hdf5")
     assert len(load_dataset(copy, cache=True)) > 0 and len(list((tmp_path / ".sb3_dce_rows").iterdir())) == 2
     with pytest.warns(DatasetWarning, match=r"rows not kept.*no home folder"):
@@ -134,6 +132,12 @@ def test_cores_that_this_process_may_not_use_do_not_count() -> None:
     code += "from sb3_dce.processes import usable_cores; print(usable_cores())"
     assert python(code).stdout.strip() == "1"
     assert usable_cores() == len(os.sched_getaffinity(0))
+
+
+def test_more_workers_than_windows_can_have_are_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert worker_pool(64, prepare_worker)._max_workers == 64
+    monkeypatch.setattr(processes, "os", SimpleNamespace(name="nt"))
+    assert worker_pool(64, prepare_worker)._max_workers == 61
 
 
 def test_a_compiler_without_the_headers_of_python_is_none(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,13 +12,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from update_tools import all_tensors, largest_difference, needs_compiler, to_float64
 
 from sb3_dce import OfflineBC, OfflineDCE, Transitions
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.errors import ConfigError
-from sb3_dce.population import Population
+from sb3_dce.population import Population, _template
+from sb3_dce.state import Storage
 
 NETS = ("actor", "critic", "critic_target", "value_net")
 MEMBERS: list[dict[str, Any]] = [
@@ -174,6 +177,24 @@ def test_population_goes_on_as_if_never_stopped(data: list[Transitions], tmp_pat
         assert largest_difference(all_tensors(one), all_tensors(other)) <= 1e-12
 
 
+@pytest.mark.usefixtures("ctrl_c")
+def test_ctrl_c_waits_until_all_members_are_written(data: list[Transitions], monkeypatch: pytest.MonkeyPatch) -> None:
+    population, other = (Population([make(data[0], seed=s) for s in range(2)]) for _ in range(2))
+    other.train(3)
+    original = Storage.write
+
+    def write(self: Storage, new: Any) -> None:
+        monkeypatch.undo()
+        original(self, new)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Storage, "write", write)
+    with pytest.raises(KeyboardInterrupt):
+        population.train(3)
+    for one, same in zip(population.models, other.models, strict=True):
+        assert largest_difference(all_tensors(one), all_tensors(same)) == 0.0
+
+
 def to_float64_loaded(loaded: OfflineAlgorithm, saved: OfflineAlgorithm) -> OfflineAlgorithm:
     """A zip is loaded into float32 networks; put the float64 numbers back."""
     to_float64(loaded).set_parameters(saved.get_parameters())
@@ -240,6 +261,29 @@ def test_members_with_networks_of_another_kind_are_refused(data: list[Transition
         Population([first, other])
     with pytest.raises(ConfigError, match=r"policy is <class .*Tanh'>, not <class .*ReLU'>"):
         Population([first, tanh])
+
+
+class Weighted(FlattenExtractor):
+    """Observations times a number that is no parameter."""
+
+    def __init__(self, observation_space: gym.Space, weight: float = 2.0) -> None:
+        super().__init__(observation_space)
+        self.register_buffer("weight", th.tensor(weight))
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return super().forward(observations) * self.weight
+
+
+def test_buffers_of_networks_are_on_the_device_and_the_same_in_all_members(data: list[Transitions]) -> None:
+    kwargs = {"policy_kwargs": {"net_arch": [16, 16], "features_extractor_class": Weighted}, "agent": OfflineBC}
+    single, member, other = (make(data[0], seed=0, **kwargs) for _ in range(3))
+    Population([member], own_randomness=True).train(3)
+    assert largest_difference(all_tensors(alone(single, 3)), all_tensors(member)) <= 1e-11
+    assert _template(member, th.device("meta")).actor.features_extractor.weight.is_meta
+    other.actor.features_extractor.weight.fill_(3.0)
+    other._n_updates = member._n_updates
+    with pytest.raises(ConfigError, match=r"buffer actor\.features_extractor\.weight is 3\.0, not 2\.0"):
+        Population([member, other])
 
 
 def test_memory_is_known_beforehand(data: list[Transitions]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import subprocess
@@ -19,11 +20,13 @@ from update_tools import all_tensors, largest_difference
 from sb3_dce import OfflineDCE
 from sb3_dce.errors import CheckpointError, ConfigError, DivergenceError
 from sb3_dce.evaluation import read_evaluations
-from sb3_dce.evaluation_pool import EvaluationPool, PendingEpisodes
+from sb3_dce.evaluation_pool import EvaluationFailedError, EvaluationPool, PendingEpisodes
+from sb3_dce.execution import Engine
 from sb3_dce.population import Population
 from sb3_dce.population_runs import STATE_FILE, BatchedRuns, train_population
 from sb3_dce.run_files import RunSpec, progress_logs, read_divergence, read_result, write_divergence
 from sb3_dce.runs import StoppedError, alone, run
+from sb3_dce.state import Storage
 
 TINY = "halfcheetah-tiny-sb3"
 QUICK = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 16}
@@ -253,6 +256,77 @@ def test_interrupted_population_saves_where_it_is(n_before: int, tmp_path: Path,
         assert largest_difference(all_tensors(one), all_tensors(other)) == 0.0
         evaluated = [read_evaluations(tmp_path / kind / f"seed_{seed}", TINY) for kind in ("parts", "whole")]
         assert evaluated[0] == evaluated[1]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_population_goes_on_and_saves_though_its_log_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    original = Population.train
+
+    def interrupted(self: Population, n_updates: int, total: int | None = None) -> None:
+        original(self, min(n_updates, 30 - self.n_updates), total)
+        if self.n_updates == 30:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Population, "train", interrupted)
+    monkeypatch.setattr(BatchedRuns, "_say_memory", lambda *_: None)  # before anything is trained it may fail
+    with open("/dev/full", "wb", buffering=0) as device, pytest.raises(KeyboardInterrupt):
+        full = io.TextIOWrapper(device, write_through=True)
+        BatchedRuns(specs(tmp_path), CPU, "eager", Console(file=full)).run()
+    assert (tmp_path / "seed_1" / "checkpoint_30.zip").exists(), "evaluations, and that it was interrupted, could not be said"
+
+
+@pytest.mark.parametrize(
+    ("place", "checkpoint"),
+    [((Storage, "write"), "checkpoint_40.zip"), ((Engine, "step_drawn"), "checkpoint_20.zip")],
+    ids=["while members are written", "in an update"],
+)
+def test_second_ctrl_c_leaves_no_member_half_of_another_moment(
+    place: tuple[type, str], checkpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = getattr(*place)
+
+    def interrupted(self: Any, *args: Any, **kwargs: Any) -> None:
+        original(self, *args, **kwargs)
+        if list(tmp_path.rglob("seed_1/checkpoint_20.zip")):
+            monkeypatch.undo()
+            raise KeyboardInterrupt  # at once, as a second one does
+
+    monkeypatch.setattr(*place, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        batched(tmp_path / "parts").run()
+    assert [path.name for path in tmp_path.rglob("seed_1/checkpoint_*")] == [checkpoint]
+    for kind in ("parts", "whole"):
+        batched(tmp_path / kind).run()
+    for seed in range(2):
+        one, other = (OfflineDCE.load(tmp_path / kind / f"seed_{seed}" / "model.zip") for kind in ("parts", "whole"))
+        assert largest_difference(all_tensors(one), all_tensors(other)) == 0.0
+
+
+def test_interruption_without_a_pending_evaluation_leaves_what_it_can_be_made_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    submit, train = EvaluationPool.submit, Population.train
+
+    def beside(self: EvaluationPool, model: Any, rollouts: Any, seed: int, parts: int = 1) -> Any:
+        return submit(EvaluationPool(0), model, rollouts, seed)
+
+    def lost(self: PendingEpisodes) -> Any:
+        raise EvaluationFailedError("its worker was killed", hint="Take fewer workers.")
+
+    def interrupted(self: Population, n_updates: int, total: int | None = None) -> None:
+        train(self, min(n_updates, 33 - self.n_updates), total)
+        if self.n_updates == 33:
+            monkeypatch.setattr(PendingEpisodes, "result", lost)
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        for place, stand_in in (((EvaluationPool, "submit"), beside), ((Population, "train"), interrupted)):
+            patch.setattr(*place, stand_in)
+        BatchedRuns(specs(tmp_path), CPU, "eager", Console(quiet=True), workers=1).run()
+    monkeypatch.undo()
+    assert [path.name for path in (tmp_path / "seed_1").glob("checkpoint_*")] == ["checkpoint_20.zip"]
+    batched(tmp_path).run()
+    assert [e.n_updates for e in read_evaluations(tmp_path / "seed_1", None)] == [20, 40]
 
 
 def test_population_ends_when_all_have_diverged(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch as th
 from torch.utils._pytree import tree_leaves
+from update_tools import largest
 
 from sb3_dce import Transitions
 from sb3_dce.base import OfflineAlgorithm
@@ -83,7 +84,7 @@ def state_of(model: OfflineAlgorithm) -> list[th.Tensor]:
 
 
 def difference(one: OfflineAlgorithm, other: OfflineAlgorithm) -> float:
-    return max(float((a - b).abs().max()) for a, b in zip(state_of(one), state_of(other), strict=True))
+    return largest(a - b for a, b in zip(state_of(one), state_of(other), strict=True))
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -408,7 +408,7 @@ def test_a_report_is_replaced_without_asking_and_anything_by_force(tmp_path: Pat
 def test_the_data_themselves_are_not_overwritten_even_by_name(tmp_path: Path) -> None:
     path = write_plain(tmp_path / "data.hdf5", base_arrays())
     before = path.read_bytes()
-    with pytest.raises(ConfigError):
+    with pytest.raises(ConfigError, match=r"exists and is not a dataset report.*Choose another name with --out"):
         write_report(path, path)
     assert path.read_bytes() == before
 

@@ -201,8 +201,12 @@ def test_page_names_a_command_that_makes_the_same_page(tmp_path: Path) -> None:
     request = Request(("run-times",), "smoke", tmp_path / "its out", updates=20, reuse=(kept,), report_only=True, page=page)
     reproduce(request, QUIET)
     made = page.read_text()
-    page.unlink()
     (command,) = re.findall(r" by `(sb3-dce .*)`; no score", made)
+    page.write_text("# My notes\n")
+    refused = sb3_dce(*shlex.split(command)[1:])
+    assert refused.code == 2 and "this file exists and is no results page" in refused.stderr
+    assert page.read_text() == "# My notes\n"
+    page.write_text("# Results\n")
     assert sb3_dce(*shlex.split(command)[1:]).code == 0
     assert page.read_text() == made and "Gradient steps: 20;" in made
 

@@ -147,6 +147,15 @@ def test_a_model_with_its_own_way_to_predict_is_asked() -> None:
     assert deterministic_act(model)(np.zeros((3, 3))).tolist() == [[0.5]] * 3
 
 
+def test_a_model_that_remembers_is_not_evaluated_as_if_it_forgot() -> None:
+    contrib = pytest.importorskip("sb3_contrib")
+    policy_kwargs = {"net_arch": [4], "lstm_hidden_size": 4}
+    model = contrib.RecurrentPPO("MlpLstmPolicy", "Pendulum-v1", n_steps=4, policy_kwargs=policy_kwargs)
+    rollouts = Rollouts(lambda: gym.make("Pendulum-v1"), N)
+    with pytest.raises(ConfigError, match=r"RecurrentPPO acts by what it remembers.*evaluate_policy\(model, env\)"):
+        evaluate(model, rollouts)
+
+
 def test_actions_are_in_the_units_of_the_environment() -> None:
     env = SpacesEnv(spaces.Box(-1, 1, (3,)), spaces.Box(np.float32([0, -5]), np.float32([10, 5])))
     model = OfflineBC("MlpPolicy", env, seed=0, policy_kwargs={"net_arch": [4]})

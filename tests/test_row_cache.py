@@ -33,7 +33,6 @@ SPEC = replace(resolve("hopper-medium-v2"), id="base-v2", obs_dim=OBS_DIM, act_d
 @pytest.fixture(autouse=True)
 def own_cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    monkeypatch.delenv(CACHE_VARIABLE, raising=False)
 
 
 @pytest.fixture

@@ -182,7 +182,9 @@ def test_rows_equal_a_row_by_row_reference(
     if has_next:  # joined everywhere, so that no unmarked jump ends an episode
         arrays["next_observations"] = np.arange(1, n + 1, dtype=np.float32)
     expected = reference_default(arrays, horizon)
-    if not expected:
+    if len(expected) < 2:
+        with pytest.raises(DatasetSemanticsError, match=f"{len(expected)} usable"):
+            Transitions.from_arrays(**arrays, max_episode_steps=horizon)
         return
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DatasetWarning)
@@ -200,7 +202,9 @@ def test_d4rl_compat_equals_the_literal_loop(flags: tuple[list[bool], list[bool]
     timeouts = np.flatnonzero(flags[1]).tolist() if has_timeouts else None
     arrays = counted(len(flags[0]), np.flatnonzero(flags[0]).tolist(), timeouts)
     expected = qlearning_dataset(arrays, horizon)
-    if len(expected["rewards"]) == 0:
+    if len(expected["rewards"]) < 2:
+        with pytest.raises(DatasetSemanticsError, match=f"{len(expected['rewards'])} usable"):
+            Transitions.from_arrays(**arrays, d4rl_compat=True, max_episode_steps=horizon)
         return
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DatasetWarning)

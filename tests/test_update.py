@@ -24,8 +24,13 @@ from update_tools import (
     all_tensors,
     check_changes_nothing_in_place,
     check_compiled_equals_eager,
+    check_metrics,
+    gradient_norm,
     largest_difference,
     needs_compiler,
+    plain_action_metrics,
+    plain_q_metrics,
+    plain_twin_gap,
     record_steps,
     to_float64,
 )
@@ -144,12 +149,16 @@ class PlainDCE:
         shared = [noise["actor"]] if self.m.share_policy_sample else []
         return [self.pi(s, e)[0] for e in shared + extra]
 
-    def take(self, optimizer: th.optim.Optimizer, loss: Callable[[], th.Tensor], net: nn.Module | None) -> None:
+    def take(self, optimizer: th.optim.Optimizer, loss: Callable[[], th.Tensor], net: nn.Module | None) -> list[th.Tensor]:
+        """One step; the loss and the norm of its gradient, for the metrics."""
         optimizer.zero_grad()
-        loss().backward()
+        value = loss()
+        value.backward()
+        norm = gradient_norm(optimizer.param_groups[0]["params"])
         if net is not None and self.m.max_grad_norm is not None:
             th.nn.utils.clip_grad_norm_(net.parameters(), self.m.max_grad_norm)
         optimizer.step()
+        return [value.detach(), norm]
 
     def penalty(self, q_pen: list[th.Tensor], q_data: th.Tensor, v: th.Tensor | None) -> th.Tensor:
         """Penalty of one critic without beta; ``q_pen`` has one tensor per action a'."""
@@ -166,8 +175,9 @@ class PlainDCE:
             return (stacked.exp().sum(dim=0).log() - q_data).mean()
         return stacked.mean()
 
-    def step(self, recorded: Step, beta: float) -> None:
-        m, noise = self.m, recorded.noise
+    def step(self, recorded: Step, beta: float) -> dict[str, Any]:
+        """One update; its metrics by their names."""
+        m, noise, got = self.m, recorded.noise, {}
         s, a, s2, d = (getattr(recorded.batch, n) for n in ("observations", "actions", "next_observations", "dones"))
         r = m.reward_scale * recorded.batch.rewards + m.reward_shift
         with th.no_grad():
@@ -188,7 +198,8 @@ class PlainDCE:
                 self.note("advantage is negative", u < 0)
                 return th.where(u < 0, (1 - m.expectile) * u**2, m.expectile * u**2).mean()
 
-            self.take(self.value_optimizer, v_loss, self.value_net)
+            got["value_loss"], got["grad_norm_v"] = self.take(self.value_optimizer, v_loss, self.value_net)
+            got |= {"value": v.mean(), "adv": (q_t - v).mean(), "adv_pos_frac": (q_t > v).double().mean()}
             with th.no_grad():
                 next_values = previous if m.v_target_timing == "previous" else self.v(self.value_net, s2)
                 if m.use_target_v:
@@ -205,35 +216,46 @@ class PlainDCE:
                 self.q(self.critic, s, action, self.masks(noise, "dropout", slice((k + 1) * BATCH, (k + 2) * BATCH)))
                 for k, action in enumerate(a_pen)
             ]
-            loss = th.zeros((), dtype=th.float64)
-            for i, q in enumerate(q_data):
-                loss = loss + m.td_loss_coef * F.mse_loss(q, y) + beta * self.penalty([pen[i] for pen in q_pen], q, v)
-            return loss
+            penalty = sum(beta * self.penalty([pen[i] for pen in q_pen], q, v) for i, q in enumerate(q_data))
+            got.update(plain_q_metrics(q_data, [y] * len(q_data)), twin_gap=plain_twin_gap(q_data), penalty=penalty.detach())
+            got.update({f"q{i}_data": q.detach().mean() for i, q in enumerate(q_data)})
+            got["q_policy"] = th.stack([th.stack(values) for values in q_pen]).detach().mean()
+            return sum(m.td_loss_coef * F.mse_loss(q, y) for q in q_data) + penalty
 
-        self.take(self.critic_optimizer, q_loss, self.critic)
+        beta_eff = beta / (2 * m.td_loss_coef)
+        got["critic_loss"], got["grad_norm_q"] = self.take(self.critic_optimizer, q_loss, self.critic)
+        got |= {"value_next": next_values.mean(), "td_target": y.mean(), "beta": beta, "beta_eff": beta_eff}
+        got |= {"q_gap": got["q_policy"] - got["q_data"], "gap_td": got["q_data"] - y.mean() + beta_eff}
         # 3 targets
         with th.no_grad():
             pairs = [(self.critic, self.critic_target)] + ([(self.value_net, self.value_net_target)] if m.use_target_v else [])
             for online, target in pairs:
                 for p, t in zip(online.parameters(), target.parameters(), strict=True):
                     t.copy_((1 - m.tau) * t + m.tau * p)
+        with th.no_grad():
+            a_pi, log_prob = self.pi(s, noise["actor"])
+        got |= plain_action_metrics(a_pi, a)
         if not recorded.variant["with_actor"]:
-            return
+            return got
         # 4 temperature
         if self.log_ent_coef is None:
             alpha = float(m.ent_coef)
         else:
             alpha = float(self.log_ent_coef.detach().exp())
             target_entropy = -float(a.shape[1]) if m.target_entropy == "auto" else float(m.target_entropy)
-            entropy_gap = (self.pi(s, noise["actor"])[1] + target_entropy).detach()
-            self.take(self.ent_coef_optimizer, lambda: -(self.log_ent_coef * entropy_gap).mean(), None)
+            entropy_gap = log_prob + target_entropy
+            got["ent_coef_loss"], _ = self.take(
+                self.ent_coef_optimizer, lambda: -(self.log_ent_coef * entropy_gap).mean(), None
+            )
+        got |= {"ent_coef": alpha, "entropy": -log_prob.mean()}
 
         # 5 actor
         def pi_loss() -> th.Tensor:
             a_pi, log_prob = self.pi(s, noise["actor"])
             return (alpha * log_prob - self.reduce(self.q(self.critic, s, a_pi), m.actor_q)).mean()
 
-        self.take(self.actor_optimizer, pi_loss, self.actor)
+        got["actor_loss"], got["grad_norm_actor"] = self.take(self.actor_optimizer, pi_loss, self.actor)
+        return got
 
     def tensors(self) -> dict[str, th.Tensor]:
         optimizers = {"actor": self.actor_optimizer, "critic": self.critic_optimizer}
@@ -312,8 +334,7 @@ def test_update_equals_the_plain_restatement(case: str, transitions: Transitions
     plain, start = PlainDCE(model), copy.deepcopy(model.policy.state_dict())
     recorded = record_steps(monkeypatch)
     model.train(20, BATCH)
-    for n, step in enumerate(recorded):
-        plain.step(step, beta_at(model, n))
+    check_metrics(model, [plain.step(step, beta_at(model, n)) for n, step in enumerate(recorded)])
     assert largest_difference(all_tensors(model), plain.tensors()) <= 1e-10
     assert largest_difference(start, model.policy.state_dict()) > 1e-3
     assert {name: sides for name, sides in plain.branches.items() if len(sides) < 2} == {}
@@ -436,7 +457,7 @@ def test_actor_and_temperature_rest_between_their_steps(transitions: Transitions
 class Probing(PlainDCE):
     """Measures the slope of each loss along one random direction of its parameters before the step is taken."""
 
-    def take(self, optimizer: th.optim.Optimizer, loss: Callable[[], th.Tensor], net: nn.Module | None) -> None:
+    def take(self, optimizer: th.optim.Optimizer, loss: Callable[[], th.Tensor], net: nn.Module | None) -> list[th.Tensor]:
         parameters, h = optimizer.param_groups[0]["params"], 1e-6
         start = parameters_to_vector(parameters).detach().clone()
         direction = th.randn(start.shape, generator=th.Generator().manual_seed(0), dtype=th.float64)
@@ -448,7 +469,7 @@ class Probing(PlainDCE):
         vector_to_parameters(start, parameters)
         name = next((n for n in NETS if getattr(self, n) is net and net is not None), "log_ent_coef")
         self.probes[name] = (direction, (ends[0] - ends[1]) / (2 * h))
-        super().take(optimizer, loss, net)
+        return super().take(optimizer, loss, net)
 
 
 @pytest.mark.parametrize("case", ["default", "without_v", "hinge", "cql", "dropout", "target_v", "previous_v"])

@@ -14,8 +14,11 @@ from update_tools import (
     all_tensors,
     check_changes_nothing_in_place,
     check_compiled_equals_eager,
+    check_metrics,
+    gradient_norm,
     largest_difference,
     needs_compiler,
+    plain_action_metrics,
     record_steps,
     to_float64,
 )
@@ -64,16 +67,23 @@ def test_update_equals_the_plain_restatement(case: str, transitions: Transitions
     model = make_model(data, **CASES[case])
     actor, start = copy.deepcopy(model.policy.actor), copy.deepcopy(model.policy.actor.state_dict())
     optimizer = model.policy.optimizer_class(actor.parameters(), lr=1e-3, **model.policy.optimizer_kwargs)
-    recorded = record_steps(monkeypatch)
+    recorded, metrics = record_steps(monkeypatch), []
     model.train(20, BATCH)
     for step in recorded:
+        s, a = step.batch.observations, step.batch.actions
         optimizer.zero_grad()
-        plain_loss(actor, step.batch.observations, step.batch.actions, model.bc_loss == "nll").backward()
+        loss = plain_loss(actor, s, a, model.bc_loss == "nll")
+        loss.backward()
+        log_std = actor.log_std(actor.latent_pi(s)).detach().clip(-20, 2).mean()
+        got = {"bc_loss": loss.detach(), "actor_loss": loss.detach(), "grad_norm_actor": gradient_norm(actor.parameters())}
+        distance = plain_action_metrics(actor.mu(actor.latent_pi(s)).tanh(), a)["action_dist"]
+        metrics.append({**got, "action_dist": distance, "log_std": log_std})
         for parameter in actor.parameters():  # the deviation has no part in the squared error
             parameter.grad = th.zeros_like(parameter) if parameter.grad is None else parameter.grad
         if model.max_grad_norm is not None:
             th.nn.utils.clip_grad_norm_(actor.parameters(), model.max_grad_norm)
         optimizer.step()
+    check_metrics(model, metrics)
     plain = {}
     for key, parameter in actor.named_parameters():
         plain[f"actor.{key}"] = parameter.detach()
@@ -83,9 +93,10 @@ def test_update_equals_the_plain_restatement(case: str, transitions: Transitions
 
 
 @needs_compiler
-def test_compiled_update_equals_the_eager_one(transitions: Transitions) -> None:
+@pytest.mark.parametrize("bc_loss", [pytest.param("mse", marks=pytest.mark.slow), "nll"])
+def test_compiled_update_equals_the_eager_one(bc_loss: str, transitions: Transitions) -> None:
     check_compiled_equals_eager(
-        lambda **kwargs: make_model(transitions, bc_loss="nll", policy_kwargs={"net_arch": [8]}, **kwargs)
+        lambda **kwargs: make_model(transitions, bc_loss=bc_loss, policy_kwargs={"net_arch": [8]}, **kwargs)
     )
 
 

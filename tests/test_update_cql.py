@@ -21,8 +21,13 @@ from update_tools import (
     all_tensors,
     check_changes_nothing_in_place,
     check_compiled_equals_eager,
+    check_metrics,
+    gradient_norm,
     largest_difference,
     needs_compiler,
+    plain_action_metrics,
+    plain_q_metrics,
+    plain_twin_gap,
     record_steps,
     to_float64,
 )
@@ -41,9 +46,6 @@ def make_model(data: Transitions, **kwargs: Any) -> OfflineCQL:
     settings |= {"n_actions": ACTIONS, "policy_eval_start": 0, "cql_weight": 2.0, **kwargs}
     model = OfflineCQL("MlpPolicy", dataset=data, policy_kwargs=policy_kwargs, **settings)
     to_float64(model)
-    if model.log_lagrange is not None:
-        model.log_lagrange = model.log_lagrange.detach().double().requires_grad_()
-        model.lagrange_optimizer = th.optim.Adam([model.log_lagrange], lr=model.lr_schedule(1))
     _centre(model)
     return model
 
@@ -95,20 +97,25 @@ class PlainCQL:
     def q(self, net: nn.Module, s: th.Tensor, a: th.Tensor) -> list[th.Tensor]:
         return [q_net(th.cat([s, a], dim=1)) for q_net in net.q_networks]
 
-    def take(self, optimizer: th.optim.Optimizer, loss: th.Tensor, net: nn.Module | None) -> None:
+    def take(self, optimizer: th.optim.Optimizer, loss: th.Tensor, net: nn.Module | None) -> list[th.Tensor]:
+        """One step; the loss and the norm of its gradient, for the metrics."""
         optimizer.zero_grad()
         loss.backward()
+        norm = gradient_norm(optimizer.param_groups[0]["params"])
         if net is not None and self.m.max_grad_norm is not None:
             nn.utils.clip_grad_norm_(net.parameters(), self.m.max_grad_norm)
         optimizer.step()
+        return [loss.detach(), norm]
 
     def penalty(self, gap: th.Tensor, w: float, multiplier: th.Tensor) -> th.Tensor:
         if self.m.lagrange_form == "gap":
             return multiplier * w * (gap - self.m.lagrange_threshold)
         return multiplier * (w * gap - self.m.lagrange_threshold)
 
-    def step(self, recorded: Step, n_updates: int) -> None:
+    def step(self, recorded: Step, n_updates: int) -> dict[str, Any]:
+        """One update; its metrics by their names."""
         m, noise, w = self.m, recorded.noise, self.m.cql_weight
+        got: dict[str, Any] = {"actor_learning_rate": self.actor_rate}
         s, a, s2, d = (getattr(recorded.batch, n) for n in ("observations", "actions", "next_observations", "dones"))
         r = m.reward_scale * recorded.batch.rewards + m.reward_shift
         # 1 temperature, used after its step
@@ -117,14 +124,16 @@ class PlainCQL:
         else:
             target = -float(a.shape[1]) if m.target_entropy == "auto" else float(m.target_entropy)
             log_prob = self.pi(s, noise["actor"])[1].detach()
-            self.take(self.ent_coef_optimizer, -(self.log_ent_coef * (log_prob + target)).mean(), None)
+            loss = -(self.log_ent_coef * (log_prob + target)).mean()
+            got["ent_coef_loss"], _ = self.take(self.ent_coef_optimizer, loss, None)
             alpha = float(self.log_ent_coef.detach().exp())
         with th.no_grad():
             # 2 target
             candidates = [self.q(self.critic_target, s2, self.pi(s2, e)[0]) for e in noise["next_actor"]]
             best = [th.stack([q[i] for q in candidates]).max(dim=0).values for i in range(len(candidates[0]))]
             self.sides |= set((best[0] < best[-1]).flatten().tolist())
-            y = r + m.gamma * (1 - d) * th.stack(best).min(dim=0).values
+            next_values = th.stack(best).min(dim=0).values
+            y = r + m.gamma * (1 - d) * next_values
             # 3 sampled actions with their log-densities
             density = 0.5 ** a.shape[1]
             sampled = [(2 * u - 1, th.full((BATCH, 1), math.log(density), dtype=th.float64)) for u in noise["uniform"]]
@@ -132,36 +141,47 @@ class PlainCQL:
             sampled += [self.pi(s, e) for e in noise["policy"]]
         before = copy.deepcopy(self.critic)
         multiplier = None if self.log_lagrange is None else th.clamp(self.log_lagrange.detach().exp(), 0, 1e6)
-        loss, gaps = th.zeros((), dtype=th.float64), []
+        loss, gaps, penalties = th.zeros((), dtype=th.float64), [], []
         values = [self.q(self.critic, s, action) for action, _ in sampled]  # a' of s' is valued at s
-        for i, q in enumerate(self.q(self.critic, s, a)):
+        q_data = self.q(self.critic, s, a)
+        for i, q in enumerate(q_data):
             pairs = zip(values, sampled, strict=True)
             weighted = th.stack([value[i].exp() / log_density.exp() for value, (_, log_density) in pairs])
             gap = weighted.sum(dim=0).log().mean() - q.mean()
             gaps.append(gap.detach())
-            loss = loss + ((q - y) ** 2).mean()
-            loss = loss + (w * gap if multiplier is None else self.penalty(gap, w, multiplier).sum())
-        self.take(self.critic_optimizer, loss, self.critic)
+            penalties.append(w * gap if multiplier is None else self.penalty(gap, w, multiplier).sum())
+            loss = loss + ((q - y) ** 2).mean() + penalties[-1]
+        got["critic_loss"], got["grad_norm_q"] = self.take(self.critic_optimizer, loss, self.critic)
+        got |= {**plain_q_metrics(q_data, [y] * len(q_data)), "value_next": next_values.mean(), "td_target": y.mean()}
+        got |= {f"q{i}_data": q.detach().mean() for i, q in enumerate(q_data)}
+        for k, name in enumerate(("q_uniform", "q_next_policy", "q_policy")):
+            got[name] = th.stack([th.stack(value) for value in values[k * m.n_actions :][: m.n_actions]]).detach().mean()
+        got |= {"q_gap": got["q_policy"] - got["q_data"], "twin_gap": plain_twin_gap(q_data)}
+        got |= {"cql_gap": sum(gaps) / len(gaps), "cql_penalty": sum(penalties).detach() / len(penalties)}
         # 4 multiplier
         if self.log_lagrange is not None:
             live = th.clamp(self.log_lagrange.exp(), 0, 1e6)
             objective = sum(self.penalty(gap, w, live).sum() for gap in gaps) / len(gaps)
             self.take(self.lagrange_optimizer, -objective, None)
+            got["lagrange"] = multiplier
         # 5 actor
         a_pi, log_prob = self.pi(s, noise["actor"])
+        mean, log_std = self.distribution(s)
+        x = th.atanh(a.clamp(-1 + 1e-5, 1 - 1e-5))
+        log_data = th.distributions.Normal(mean, log_std.exp()).log_prob(x) - (1 - x.tanh() ** 2 + 1e-6).log()
+        got |= {"bc_loss": -log_data.detach().sum(dim=1).mean(), "entropy": -log_prob.detach().mean(), "ent_coef": alpha}
+        got |= plain_action_metrics(a_pi, a)
         if n_updates < m.policy_eval_start:
-            mean, log_std = self.distribution(s)
-            x = th.atanh(a.clamp(-1 + 1e-5, 1 - 1e-5))
-            log_data = th.distributions.Normal(mean, log_std.exp()).log_prob(x) - (1 - x.tanh() ** 2 + 1e-6).log()
             actor_loss = (alpha * log_prob - log_data.sum(dim=1, keepdim=True)).mean()
         else:
             critic = before if m.actor_q_timing == "previous" else self.critic
             actor_loss = (alpha * log_prob - th.stack(self.q(critic, s, a_pi)).min(dim=0).values).mean()
-        self.take(self.actor_optimizer, actor_loss, self.actor)
+        got["actor_loss"], got["grad_norm_actor"] = self.take(self.actor_optimizer, actor_loss, self.actor)
         # 6 targets
         with th.no_grad():
             for p, t in zip(self.critic.parameters(), self.critic_target.parameters(), strict=True):
                 t.copy_((1 - m.tau) * t + m.tau * p)
+        return got
 
     def tensors(self) -> dict[str, th.Tensor]:
         found: dict[str, th.Tensor] = {}
@@ -177,16 +197,6 @@ class PlainCQL:
                 for moment in ("exp_avg", "exp_avg_sq"):
                     found[f"log_{name}.{moment}"] = getattr(self, f"{name}_optimizer").state[scalar][moment]
         return found
-
-
-def tensors_of(model: OfflineCQL) -> dict[str, th.Tensor]:
-    """Parameters, moments, temperature and multiplier by name."""
-    found = all_tensors(model)
-    if model.log_lagrange is not None:
-        found["log_lagrange"] = model.log_lagrange.detach()
-        for moment in ("exp_avg", "exp_avg_sq"):
-            found[f"log_lagrange.{moment}"] = model.lagrange_optimizer.state[model.log_lagrange][moment]
-    return found
 
 
 CASES: dict[str, dict[str, Any]] = {
@@ -213,9 +223,8 @@ def test_update_equals_the_plain_restatement(case: str, transitions: Transitions
     plain, start = PlainCQL(model), copy.deepcopy(model.policy.state_dict())
     recorded = record_steps(monkeypatch)
     model.train(10, BATCH)
-    for n, step in enumerate(recorded):
-        plain.step(step, n)
-    assert largest_difference(tensors_of(model), plain.tensors()) <= 1e-10
+    check_metrics(model, [plain.step(step, n) for n, step in enumerate(recorded)])
+    assert largest_difference(all_tensors(model), plain.tensors()) <= 1e-10
     assert largest_difference(start, model.policy.state_dict()) > 1e-3
     assert plain.sides == {True, False}, "each critic must be the smaller one somewhere"
 
@@ -226,7 +235,7 @@ def test_batched_critics_train_like_critics_one_by_one(transitions: Transitions,
     monkeypatch.setattr(ensembles, "batched_products_pay", lambda device: True)
     batched = make_model(transitions, normalize_obs=True, lagrange_threshold=5.0)
     batched.train(10, BATCH)
-    assert largest_difference(tensors_of(one_by_one), tensors_of(batched)) <= 1e-12
+    assert largest_difference(all_tensors(one_by_one), all_tensors(batched)) <= 1e-12
 
 
 @pytest.mark.slow  # its graph is the largest but those of PBRL and UWAC
@@ -376,7 +385,7 @@ def test_multiplier_and_its_moments_are_saved(hdf5_file: Path, tmp_path: Path) -
     assert th.equal(loaded.log_lagrange, model.log_lagrange) and float(model.log_lagrange.detach()) != 0.0
     model.learn(4, reset_num_timesteps=False)  # over the end of the cloning
     loaded.learn(4, reset_num_timesteps=False)
-    assert largest_difference(tensors_of(model), tensors_of(loaded)) == 0.0
+    assert largest_difference(all_tensors(model), all_tensors(loaded)) == 0.0
     make().save(tmp_path / "without.zip")
     with pytest.raises(CheckpointError, match="lagrange_optimizer"):
         OfflineCQL.load(tmp_path / "without.zip", lagrange_threshold=1.0)

@@ -18,8 +18,12 @@ from update_tools import (
     all_tensors,
     check_changes_nothing_in_place,
     check_compiled_equals_eager,
+    check_metrics,
+    gradient_norm,
     largest_difference,
     needs_compiler,
+    plain_action_metrics,
+    plain_q_metrics,
     record_steps,
     to_float64,
 )
@@ -74,7 +78,8 @@ class PlainIQL:
     def q(self, net: nn.Module, s: th.Tensor, a: th.Tensor) -> list[th.Tensor]:
         return [q_net(th.cat([s, a], dim=1)) for q_net in net.q_networks]
 
-    def log_prob(self, s: th.Tensor, a: th.Tensor, noise: dict[str, th.Tensor]) -> th.Tensor:
+    def distribution(self, s: th.Tensor, noise: dict[str, th.Tensor]) -> tuple[th.Tensor, th.Tensor]:
+        """Mean and logarithm of the deviation."""
         x, n_hidden = s, 0
         for layer in self.actor.latent_pi:
             x = layer(x)
@@ -84,19 +89,22 @@ class PlainIQL:
                     self.note("unit is dropped", mask == 0)
                     x = x * mask
                 n_hidden += 1
-        mean, std = th.tanh(self.actor.mu(x)), th.exp(th.clip(self.actor.log_std, -5.0, 2.0))
-        return th.distributions.Independent(th.distributions.Normal(mean, std), 1).log_prob(a).unsqueeze(1)
+        return th.tanh(self.actor.mu(x)), th.clip(self.actor.log_std, -5.0, 2.0)
 
-    def take(self, name: str, loss: th.Tensor) -> None:
+    def take(self, name: str, loss: th.Tensor) -> list[th.Tensor]:
+        """One step; the loss and the norm of its gradient, for the metrics."""
         optimizer = self.optimizers[name]
         optimizer.zero_grad()
         loss.backward()
+        norm = gradient_norm(getattr(self, name).parameters())
         if self.m.max_grad_norm is not None:
             th.nn.utils.clip_grad_norm_(getattr(self, name).parameters(), self.m.max_grad_norm)
         optimizer.step()
+        return [loss.detach(), norm]
 
-    def step(self, recorded: Step, actor_rate: float) -> None:
-        m, batch = self.m, recorded.batch
+    def step(self, recorded: Step, actor_rate: float) -> dict[str, Any]:
+        """One update; its metrics by their names."""
+        m, batch, got = self.m, recorded.batch, {"actor_learning_rate": actor_rate}
         s, s2, d = batch.observations, batch.next_observations, batch.dones
         self.note("action is clipped", batch.actions.abs() > 1 - 1e-5)
         a = th.clip(batch.actions, -(1 - 1e-5), 1 - 1e-5)
@@ -107,25 +115,39 @@ class PlainIQL:
             if len(stacked) > 1:
                 self.note("first critic is the smallest", stacked.argmin(dim=0) == 0)
             q_t = stacked.min(dim=0).values
-        u = q_t - self.value_net.value_net(s)
+        v = self.value_net.value_net(s)
+        u = q_t - v
         self.note("advantage is negative", u < 0)
-        self.take("value_net", th.where(u < 0, (1 - m.expectile) * u**2, m.expectile * u**2).mean())
+        v_loss = th.where(u < 0, (1 - m.expectile) * u**2, m.expectile * u**2).mean()
+        got["value_loss"], got["grad_norm_v"] = self.take("value_net", v_loss)
         # 2 actor, with the new V
         with th.no_grad():
-            weights = th.exp(m.temperature * (q_t - self.value_net.value_net(s)))
+            adv = q_t - self.value_net.value_net(s)
+            weights = th.exp(m.temperature * adv)
             if m.temperature > 0:
                 self.note("weight is cut", weights > m.max_weight)
+            got["weight_max_frac"] = (weights >= m.max_weight).double().mean()
             weights = weights.clip(max=m.max_weight)
+        mean, log_std = self.distribution(s, recorded.noise)
+        gaussian = th.distributions.Independent(th.distributions.Normal(mean, log_std.exp()), 1)
         self.optimizers["actor"].param_groups[0]["lr"] = actor_rate
-        self.take("actor", -(weights * self.log_prob(s, a, recorded.noise)).mean())
+        pi_loss = -(weights * gaussian.log_prob(a).unsqueeze(1)).mean()
+        got["actor_loss"], got["grad_norm_actor"] = self.take("actor", pi_loss)
+        got |= {"value": v.mean(), "adv": adv.mean(), "adv_pos_frac": (adv > 0).double().mean(), "weight": weights.mean()}
+        got |= {"log_std": log_std.mean(), "entropy": gaussian.entropy().mean()}
+        got["action_dist"] = plain_action_metrics(mean, a)["action_dist"]
         # 3 critics, with the new V
         with th.no_grad():
-            y = r + m.gamma * (1 - d) * self.value_net.value_net(s2)
-        self.take("critic", sum(((q - y) ** 2).mean() for q in self.q(self.critic, s, a)))
+            next_values = self.value_net.value_net(s2)
+            y = r + m.gamma * (1 - d) * next_values
+        q_data = self.q(self.critic, s, a)
+        got |= {**plain_q_metrics(q_data, [y] * len(q_data)), "value_next": next_values.mean(), "td_target": y.mean()}
+        got["critic_loss"], got["grad_norm_q"] = self.take("critic", sum(((q - y) ** 2).mean() for q in q_data))
         # 4 targets
         with th.no_grad():
             for p, t in zip(self.critic.parameters(), self.critic_target.parameters(), strict=True):
                 t.copy_((1 - m.tau) * t + m.tau * p)
+        return got
 
     def tensors(self) -> dict[str, th.Tensor]:
         found: dict[str, th.Tensor] = {}
@@ -172,9 +194,9 @@ def test_update_equals_the_plain_restatement(case: str, transitions: Transitions
     for n in range(20):
         model._current_progress_remaining = 1 - n / 20
         model.train(1, BATCH)
-    for n, step in enumerate(recorded):
-        cosine = 1e-3 * 0.5 * (1 + math.cos(math.pi * n / 20))
-        plain.step(step, 1e-3 if model.actor_lr_schedule == "constant" else cosine)
+    constant = model.actor_lr_schedule == "constant"
+    rates = [1e-3 if constant else 1e-3 * 0.5 * (1 + math.cos(math.pi * n / 20)) for n in range(20)]
+    check_metrics(model, [plain.step(step, rate) for step, rate in zip(recorded, rates, strict=True)])
     assert largest_difference(all_tensors(model), plain.tensors()) <= 1e-10
     assert largest_difference(start, model.policy.state_dict()) > 1e-3
     assert {name: sides for name, sides in plain.branches.items() if len(sides) < 2} == {}

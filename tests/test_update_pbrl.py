@@ -21,8 +21,12 @@ from update_tools import (
     check_changes_nothing_in_place,
     check_compiled_equals_eager,
     check_many_at_once_equal_single_runs,
+    check_metrics,
+    gradient_norm,
     largest_difference,
     needs_compiler,
+    plain_action_metrics,
+    plain_q_metrics,
     record_steps,
     to_float64,
 )
@@ -41,7 +45,6 @@ def make_model(data: Transitions, **kwargs: Any) -> OfflinePBRL:
     settings |= {"n_critics": CRITICS, "n_ood_actions": ACTIONS, "uncertainty_coef": 0.5, **kwargs}
     model = OfflinePBRL("MlpPolicy", dataset=data, policy_kwargs=policy_kwargs, **settings)
     to_float64(model)
-    model.ood_q = model.ood_q.double()
     _centre(model)
     return model
 
@@ -77,13 +80,13 @@ class PlainPBRL:
         self.m = model
         for name in model.networks:
             setattr(self, name, copy.deepcopy(getattr(model.policy, name)))
-        actor_rate = model.actor_learning_rate or model.learning_rate
-        self.actor_optimizer = th.optim.Adam(self.actor.parameters(), lr=actor_rate)
+        self.actor_rate = model.actor_learning_rate or model.learning_rate
+        self.actor_optimizer = th.optim.Adam(self.actor.parameters(), lr=self.actor_rate)
         self.critic_optimizers = [th.optim.Adam(q.parameters(), lr=model.learning_rate) for q in self.critic.q_networks]
         self.log_ent_coef = None
         if model.log_ent_coef is not None:
             self.log_ent_coef = model.log_ent_coef.detach().clone().requires_grad_()
-            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=actor_rate)
+            self.ent_coef_optimizer = th.optim.Adam([self.log_ent_coef], lr=self.actor_rate)
         self.smallest: set[int] = set()
         self.clipped: set[bool] = set()
         self.recorded = 0.0
@@ -106,8 +109,10 @@ class PlainPBRL:
             target = target.clamp(min=self.m.pseudo_target_floor)
         return target
 
-    def step(self, recorded: Step, w_s: float) -> None:
+    def step(self, recorded: Step, w_s: float) -> dict[str, Any]:
+        """One update; its metrics by their names."""
         m, noise = self.m, recorded.noise
+        got: dict[str, Any] = {"actor_learning_rate": self.actor_rate, "ood_weight": w_s}
         s, a, s2, d = (getattr(recorded.batch, n) for n in ("observations", "actions", "next_observations", "dones"))
         r = m.reward_scale * recorded.batch.rewards + m.reward_shift
         # 1 temperature, used after its step
@@ -117,30 +122,43 @@ class PlainPBRL:
             target = -float(a.shape[1]) if m.target_entropy == "auto" else float(m.target_entropy)
             log_prob = self.pi(s, noise["actor"])[1].detach()
             self.ent_coef_optimizer.zero_grad()
-            (-(self.log_ent_coef * (log_prob + target)).mean()).backward()
+            loss = -(self.log_ent_coef * (log_prob + target)).mean()
+            loss.backward()
+            got["ent_coef_loss"] = loss.detach()
             self.ent_coef_optimizer.step()
             alpha = float(self.log_ent_coef.detach().exp())
         # 2 targets and 3 pseudo-targets
         with th.no_grad():
             next_q = self.q(self.critic_target, s2, self.pi(s2, noise["next_actor"])[0])
             u_t = disagreement(next_q)
-            targets = [r + m.gamma * (1 - d) * (q - m.uncertainty_coef * u_t) for q in next_q]
+            next_values = [q - m.uncertainty_coef * u_t for q in next_q]
+            targets = [r + m.gamma * (1 - d) * value for value in next_values]
             ood = [(s, self.pi(s, e)[0], w_s) for e in noise["ood"]]
             ood += [(s2, self.pi(s2, e)[0], m.ood_weight_next) for e in noise["next_ood"]]
         q_data = self.q(self.critic, s, a)
         q_ood = [self.q(self.critic, *pair) for *pair, _ in ood]
         # every pair (state, k-th action) counts as one of 2 * ACTIONS * n rows
-        self.recorded = float(th.stack([th.stack(values) for values in q_ood[:ACTIONS]]).mean().detach())
-        losses_ = []
+        q_policy, q_next_policy = (
+            th.stack([th.stack(values) for values in part]).detach().mean() for part in (q_ood[:ACTIONS], q_ood[ACTIONS:])
+        )
+        self.recorded = float(q_policy)
+        losses_, ood_losses = [], []
         for k, y in enumerate(targets):
             rows = [
                 (values[k] - self.pseudo_target(values[k], disagreement(values), w)) ** 2
                 for values, (_, _, w) in zip(q_ood, ood, strict=True)
             ]
-            losses_.append(((q_data[k] - y) ** 2).mean() + th.cat(rows).mean())
+            ood_losses.append(th.cat(rows).mean())
+            losses_.append(((q_data[k] - y) ** 2).mean() + ood_losses[-1])
         for optimizer in self.critic_optimizers:
             optimizer.zero_grad()
         sum(losses_).backward()
+        got |= {**plain_q_metrics(q_data, targets), "critic_loss": sum(losses_).detach()}
+        got |= {"grad_norm_q": gradient_norm(self.critic.parameters()), "ood_loss": sum(ood_losses).detach() / len(targets)}
+        got |= {"value_next": sum(next_values).mean() / len(targets), "td_target": sum(targets).mean() / len(targets)}
+        got |= {"q_policy": q_policy, "q_next_policy": q_next_policy, "q_gap": q_policy - got["q_data"]}
+        got |= {"uncertainty_data": disagreement(q_data).detach().mean(), "uncertainty_next": u_t.mean()}
+        got["uncertainty_policy"] = sum(disagreement(q).detach().mean() for q in q_ood[:ACTIONS]) / ACTIONS
         if m.max_grad_norm is not None:
             nn.utils.clip_grad_norm_(self.critic.parameters(), m.max_grad_norm)
         for optimizer in self.critic_optimizers:
@@ -150,7 +168,10 @@ class PlainPBRL:
         q_pi = th.stack(self.q(self.critic, s, a_pi))
         self.smallest |= set(q_pi.argmin(dim=0).flatten().tolist())
         self.actor_optimizer.zero_grad()
-        (alpha * log_prob - q_pi.min(dim=0).values).mean().backward()
+        loss = (alpha * log_prob - q_pi.min(dim=0).values).mean()
+        loss.backward()
+        got |= {"actor_loss": loss.detach(), "grad_norm_actor": gradient_norm(self.actor.parameters()), "ent_coef": alpha}
+        got |= {"entropy": -log_prob.detach().mean(), **plain_action_metrics(a_pi, a)}
         if m.max_grad_norm is not None:
             nn.utils.clip_grad_norm_(self.actor.parameters(), m.max_grad_norm)
         self.actor_optimizer.step()
@@ -158,6 +179,7 @@ class PlainPBRL:
         with th.no_grad():
             for p, t in zip(self.critic.parameters(), self.critic_target.parameters(), strict=True):
                 t.copy_((1 - m.tau) * t + m.tau * p)
+        return got
 
     def tensors(self) -> dict[str, th.Tensor]:
         moments = {p: o.state[p] for o in (self.actor_optimizer, *self.critic_optimizers) for p in o.param_groups[0]["params"]}
@@ -206,14 +228,15 @@ def test_update_equals_the_plain_restatement(case: str, transitions: Transitions
     plain, start = PlainPBRL(model), copy.deepcopy(model.policy.state_dict())
     recorded = record_steps(monkeypatch)
     model.train(20, BATCH)
-    values, divisions = [], 0
+    values, divisions, metrics = [], 0, []
     for n, step in enumerate(recorded):
         w_s = weight_at(model, n) / model.ood_weight_decay**divisions
-        plain.step(step, w_s)
+        metrics.append(plain.step(step, w_s))
         if model.adaptive_ood_weight and n % model.steps_per_epoch == 0:  # once per epoch, the linear part being over
             recent, before = values[-5:], values[-20:-5]
             divisions += n + 1 > model.ood_weight_steps and w_s > 0.2 and bool(before) and np.mean(recent) < np.mean(before)
             values.append(plain.recorded)
+    check_metrics(model, metrics)
     assert divisions == model.n_ood_weight_decays and (divisions > 0) == (case == "adaptive_divides")
     assert largest_difference(all_tensors(model), plain.tensors()) <= 1e-10
     assert largest_difference(start, model.policy.state_dict()) > 1e-3

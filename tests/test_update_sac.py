@@ -11,14 +11,19 @@ import pytest
 import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
+from test_update import squashed
 from torch import nn
 from update_tools import (
     Step,
     all_tensors,
     check_changes_nothing_in_place,
     check_compiled_equals_eager,
+    check_metrics,
+    gradient_norm,
     largest_difference,
     needs_compiler,
+    plain_action_metrics,
+    plain_q_metrics,
     record_steps,
     to_float64,
 )
@@ -143,6 +148,39 @@ def test_metrics_are_those_of_stable_baselines3(
     ours, theirs = model.read_metrics(), sac.logger.name_to_value
     for name in ("critic_loss", "actor_loss", "ent_coef", "ent_coef_loss"):
         assert ours[name] == pytest.approx(float(theirs[f"train/{name}"]), abs=1e-10), name
+
+
+def test_metrics_are_what_their_names_say(transitions: Transitions, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of one update: Stable-Baselines3 logs a few only."""
+    model = make_model(transitions, ent_coef="auto_0.5")
+    policy, log_alpha = copy.deepcopy(model.policy), model.log_ent_coef.detach().clone()
+    alpha, recorded = float(log_alpha.exp()), record_steps(monkeypatch)
+    model.train(1, BATCH)
+    batch, noise = recorded[0].batch, recorded[0].noise
+    s, a, s2, d = batch.observations, batch.actions, batch.next_observations, batch.dones
+
+    def pi(obs: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        mean, log_std, _ = policy.actor.get_action_dist_params(obs)
+        return squashed(mean, log_std, noise)
+
+    with th.no_grad():
+        a2, next_log_prob = pi(s2, noise["next_actor"])
+        next_values = th.stack(policy.critic_target(s2, a2)).min(dim=0).values
+        y = batch.rewards + model.gamma * (1 - d) * (next_values - alpha * next_log_prob)
+    q_data = policy.critic(s, a)
+    critic_loss = 0.5 * sum(((q - y) ** 2).mean() for q in q_data)
+    critic_loss.backward()
+    a_pi, log_prob = pi(s, noise["actor"])
+    q_pi = th.stack(model.critic(s, a_pi))  # critics after their step
+    actor_loss = (alpha * log_prob - q_pi.min(dim=0).values).mean()
+    actor_loss.backward()
+    q_policy, log_prob = q_pi.detach().mean(), log_prob.detach()
+    got = {**plain_q_metrics(q_data, [y] * 2), **plain_action_metrics(a_pi, a), "q_policy": q_policy, "ent_coef": alpha}
+    got |= {"value_next": next_values.mean(), "td_target": y.mean(), "q_gap": q_policy - got["q_data"]}
+    got |= {"critic_loss": critic_loss.detach(), "grad_norm_q": gradient_norm(policy.critic.parameters())}
+    got |= {"actor_loss": actor_loss.detach(), "grad_norm_actor": gradient_norm(policy.actor.parameters())}
+    got |= {"entropy": -log_prob.mean(), "ent_coef_loss": -(log_alpha * (log_prob - 2.0)).mean()}
+    check_metrics(model, [got])
 
 
 def test_max_grad_norm_clips_every_network(transitions: Transitions) -> None:

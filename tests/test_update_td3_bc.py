@@ -16,8 +16,12 @@ from update_tools import (
     all_tensors,
     check_changes_nothing_in_place,
     check_compiled_equals_eager,
+    check_metrics,
+    gradient_norm,
     largest_difference,
     needs_compiler,
+    plain_action_metrics,
+    plain_q_metrics,
     record_steps,
     to_float64,
 )
@@ -77,14 +81,18 @@ class PlainTD3BC:
     def q(self, net: nn.Module, s: th.Tensor, a: th.Tensor) -> list[th.Tensor]:
         return [q_net(th.cat([self.inputs(s), a], dim=1)) for q_net in net.q_networks]
 
-    def take(self, optimizer: th.optim.Optimizer, loss: th.Tensor, net: nn.Module) -> None:
+    def take(self, optimizer: th.optim.Optimizer, loss: th.Tensor, net: nn.Module) -> list[th.Tensor]:
+        """One step; the loss and the norm of its gradient, for the metrics."""
         optimizer.zero_grad()
         loss.backward()
+        norm = gradient_norm(net.parameters())
         if self.m.max_grad_norm is not None:
             th.nn.utils.clip_grad_norm_(net.parameters(), self.m.max_grad_norm)
         optimizer.step()
+        return [loss.detach(), norm]
 
-    def step(self, recorded: Step) -> None:
+    def step(self, recorded: Step) -> dict[str, Any]:
+        """One update; its metrics by their names."""
         m, batch = self.m, recorded.batch
         s, a, s2, d = batch.observations, batch.actions, batch.next_observations, batch.dones
         r = m.reward_scale * batch.rewards + m.reward_shift
@@ -97,24 +105,30 @@ class PlainTD3BC:
             stacked = th.stack(self.q(self.critic_target, s2, smoothed.clip(-1, 1)))
             if len(stacked) > 1:
                 self.note("first critic is the smallest", stacked.argmin(dim=0) == 0)
-            y = r + m.gamma * (1 - d) * stacked.min(dim=0).values
+            next_values = stacked.min(dim=0).values
+            y = r + m.gamma * (1 - d) * next_values
         # 2 critics
-        q_loss = sum(((q - y) ** 2).mean() for q in self.q(self.critic, s, a))
-        self.take(self.critic_optimizer, q_loss, self.critic)
+        q_data = self.q(self.critic, s, a)
+        got = {**plain_q_metrics(q_data, [y] * len(q_data)), "value_next": next_values.mean(), "td_target": y.mean()}
+        q_loss = sum(((q - y) ** 2).mean() for q in q_data)
+        got["critic_loss"], got["grad_norm_q"] = self.take(self.critic_optimizer, q_loss, self.critic)
         # 3 actor, 4 targets
         self.n += 1
         if self.n % m.policy_update_freq != 0:
-            return
+            return got
         actions = self.pi(self.actor, s)
         q1 = self.q(self.critic, s, actions)[0]
         self.note("value of the policy is negative", q1 < 0)
         factor = m.alpha / q1.abs().mean().item()
-        n_entries = a.numel()
-        self.take(self.actor_optimizer, -factor * q1.mean() + ((actions - a) ** 2).sum() / n_entries, self.actor)
+        clone = ((actions - a) ** 2).sum() / a.numel()
+        got |= {"lambda": factor, "bc_loss": clone.detach(), **plain_action_metrics(actions, a)}
+        got |= {"q_policy": q1.detach().mean(), "q_gap": q1.detach().mean() - got["q_data"]}
+        got["actor_loss"], got["grad_norm_actor"] = self.take(self.actor_optimizer, -factor * q1.mean() + clone, self.actor)
         with th.no_grad():
             for online, target in ((self.critic, self.critic_target), (self.actor, self.actor_target)):
                 for p, t in zip(online.parameters(), target.parameters(), strict=True):
                     t.copy_((1 - m.tau) * t + m.tau * p)
+        return got
 
     def tensors(self) -> dict[str, th.Tensor]:
         optimizers = {"actor": self.actor_optimizer, "critic": self.critic_optimizer}
@@ -150,8 +164,7 @@ def test_update_equals_the_plain_restatement(case: str, transitions: Transitions
     plain, start = PlainTD3BC(model), copy.deepcopy(model.policy.state_dict())
     recorded = record_steps(monkeypatch)
     model.train(20, BATCH)
-    for step in recorded:
-        plain.step(step)
+    check_metrics(model, [plain.step(step) for step in recorded])
     assert largest_difference(all_tensors(model), plain.tensors()) <= 1e-10
     assert largest_difference(start, model.policy.state_dict()) > 1e-3
     assert {name: sides for name, sides in plain.branches.items() if len(sides) < 2} == {}

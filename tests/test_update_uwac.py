@@ -23,8 +23,14 @@ from update_tools import (
     all_tensors,
     check_changes_nothing_in_place,
     check_compiled_equals_eager,
+    check_metrics,
+    gradient_norm,
+    largest,
     largest_difference,
     needs_compiler,
+    plain_action_metrics,
+    plain_q_metrics,
+    plain_twin_gap,
     record_steps,
     to_float64,
 )
@@ -43,20 +49,15 @@ def make_model(data: Transitions, **kwargs: Any) -> OfflineUWAC:
     """A small float64 agent."""
     policy_kwargs = {"net_arch": [16, 16], **kwargs.pop("policy_kwargs", {})}
     model = OfflineUWAC("MlpPolicy", dataset=data, policy_kwargs=policy_kwargs, **{"execution": "eager", **SMALL, **kwargs})
-    to_float64(model)
-    model.log_alpha = model.log_alpha.detach().double().requires_grad_()
-    model.alpha_optimizer = th.optim.Adam([model.log_alpha], lr=model.alpha_learning_rate)
-    return model
+    return to_float64(model)
 
 
 def tensors_of(model: OfflineUWAC) -> dict[str, th.Tensor]:
-    """Everything that training changes."""
+    """Everything that training changes: the vectors of the power iteration too."""
     found = all_tensors(model)
     for net in ("critic", "critic_target"):
         found |= {f"{net}.{name}": buffer for name, buffer in getattr(model, net).named_buffers()}
-    found["log_alpha"] = model.log_alpha.detach()
-    moments = model.alpha_optimizer.state[model.log_alpha]
-    return found | {f"log_alpha.{name}": moments[name] for name in ("exp_avg", "exp_avg_sq")}
+    return found
 
 
 # -- the plain restatement ---------------------------------------------------------------------------------------------
@@ -125,9 +126,9 @@ class PlainUWAC:
         n = model.critic.n_critics
         self.critics = nn.ModuleList(PlainCritic(model.critic, i) for i in range(n))
         self.targets = nn.ModuleList(PlainCritic(model.critic_target, i) for i in range(n))
-        actor_rate = model.learning_rate if model.actor_learning_rate is None else model.actor_learning_rate
+        self.actor_rate = model.learning_rate if model.actor_learning_rate is None else model.actor_learning_rate
         self.critic_optimizer = th.optim.Adam(self.critics.parameters(), lr=model.learning_rate)
-        self.actor_optimizer = th.optim.Adam(self.actor.parameters(), lr=actor_rate)
+        self.actor_optimizer = th.optim.Adam(self.actor.parameters(), lr=self.actor_rate)
         self.vae_optimizer = th.optim.Adam(self.vae.parameters(), lr=model.learning_rate)
         self.log_alpha = model.log_alpha.detach().clone().requires_grad_()
         self.alpha_optimizer = th.optim.Adam([self.log_alpha], lr=model.alpha_learning_rate)
@@ -145,8 +146,9 @@ class PlainUWAC:
         if self.m.max_grad_norm is not None:
             nn.utils.clip_grad_norm_(net.parameters(), self.m.max_grad_norm)
 
-    def step(self, recorded: Step, n_updates: int) -> None:
-        m, noise = self.m, recorded.noise
+    def step(self, recorded: Step, n_updates: int) -> dict[str, Any]:
+        """One update; its metrics by their names."""
+        m, noise, got = self.m, recorded.noise, {"actor_learning_rate": self.actor_rate}
         s, a, s2, d = (getattr(recorded.batch, n) for n in ("observations", "actions", "next_observations", "dones"))
         r = m.reward_scale * recorded.batch.rewards + m.reward_shift
         # 1 variational autoencoder
@@ -154,8 +156,11 @@ class PlainUWAC:
         mean, std = self.vae.mean(hidden), self.vae.log_std(hidden).clamp(-4, 15).exp()
         reconstruction = self.vae.decoder(th.cat([s, mean + std * noise["vae"]], dim=1)).tanh()
         kl = -0.5 * (1 + (std**2).log() - mean**2 - std**2).mean()
+        mse = nn.functional.mse_loss(reconstruction, a)
         self.vae_optimizer.zero_grad()
-        (nn.functional.mse_loss(reconstruction, a) + 0.5 * kl).backward()
+        (mse + 0.5 * kl).backward()
+        got |= {"vae_loss": (mse + 0.5 * kl).detach(), "vae_mse": mse.detach(), "vae_kl": kl.detach()}
+        got["grad_norm_vae"] = gradient_norm(self.vae.parameters())
         self.clip(self.vae)
         self.vae_optimizer.step()
         # 2 target
@@ -172,13 +177,17 @@ class PlainUWAC:
             y = r + m.gamma * (1 - d) * best[:, None]
             w = th.clamp(th.exp(-m.uwac_beta * variance), 0, 1)[:, None]
             self.weights += w.flatten().tolist()
+            got |= {"value_next": best.mean(), "td_target": y.mean(), "target_variance": variance.mean()}
+            got |= {"weight": w.mean(), "weight_min": w.min()}
         # 3 critics
+        q_data = [critic(s, a, self.masks(noise, "dropout", i)) for i, critic in enumerate(self.critics)]
         critic_loss = th.zeros((), dtype=th.float64)
-        for i, critic in enumerate(self.critics):
-            errors = critic(s, a, self.masks(noise, "dropout", i)) - y
-            critic_loss = critic_loss + (((errors * w) ** 2).mean() if m.weight_squared else (w * errors**2).mean())
+        for q in q_data:
+            critic_loss = critic_loss + ((((q - y) * w) ** 2).mean() if m.weight_squared else (w * (q - y) ** 2).mean())
         self.critic_optimizer.zero_grad()
         critic_loss.backward()
+        got |= {**plain_q_metrics(q_data, [y] * len(q_data)), "twin_gap": plain_twin_gap(q_data)}
+        got |= {"critic_loss": critic_loss.detach(), "grad_norm_q": gradient_norm(self.critics.parameters())}
         self.clip(self.critics)
         if m.actor_q_timing == "updated":
             self.critic_optimizer.step()
@@ -188,7 +197,8 @@ class PlainUWAC:
         with th.no_grad():
             latents = noise["mmd_vae"].clamp(-0.5, 0.5)
             like_data = th.stack([self.vae.decoder(th.cat([s, z], dim=1)) for z in latents])
-        violation = plain_mmd(raw, like_data, m.mmd_sigma) - m.mmd_threshold
+        mmd = plain_mmd(raw, like_data, m.mmd_sigma)
+        violation = mmd - m.mmd_threshold
         stats = [
             critic.passes(s, raw[0].tanh()[None], self.masks(noise, "actor_dropout", i), m.n_mc_dropout)
             for i, critic in enumerate(self.critics)
@@ -200,9 +210,16 @@ class PlainUWAC:
             q = th.stack([mean[0] for mean, _ in stats]).min(dim=0).values
             w_pi = th.clamp(th.exp(-m.uwac_beta * sum(v[0] for _, v in stats)), 0, 1).detach()
             actor_loss = (-q * w_pi + alpha * violation).mean()
+            got |= {"policy_variance": sum(v[0] for _, v in stats).detach().mean(), "policy_weight": w_pi.mean()}
+            got["q_policy"] = sum(mean[0] for mean, _ in stats).detach().mean() / len(stats)
+            got["q_gap"] = got["q_policy"] - got["q_data"]
         parameters = list(self.actor.parameters())
         for parameter, gradient in zip(parameters, th.autograd.grad(actor_loss, parameters, retain_graph=True), strict=True):
             parameter.grad = gradient
+        got |= {"actor_loss": actor_loss.detach(), "grad_norm_actor": gradient_norm(parameters)}
+        got |= {"mmd": mmd.detach().mean(), "alpha": self.alphas[-1], **plain_action_metrics(raw[0].tanh(), a)}
+        density = th.distributions.Normal(mu, sigma).log_prob(raw[0]) - (1 - raw[0].tanh() ** 2 + 1e-6).log()
+        got["entropy"] = -density.detach().sum(dim=1).mean()
         self.clip(self.actor)
         # 5 the multiplier ascends on the same loss
         (ascent,) = th.autograd.grad(actor_loss, self.log_alpha)
@@ -216,6 +233,7 @@ class PlainUWAC:
             # 6 targets
             for p, t in zip(self.critics.parameters(), self.targets.parameters(), strict=True):
                 t.copy_((1 - m.tau) * t + m.tau * p)
+        return got
 
     def tensors(self) -> dict[str, th.Tensor]:
         """By the names of :func:`tensors_of`."""
@@ -270,13 +288,11 @@ def test_update_is_the_plain_restatement(case: str, transitions: Transitions, mo
     plain, start = PlainUWAC(model), copy.deepcopy(model.policy.state_dict())
     recorded = record_steps(monkeypatch)
     model.train(10, BATCH)
-    for n, step in enumerate(recorded):
-        plain.step(step, n)
+    check_metrics(model, [plain.step(step, n) for n, step in enumerate(recorded)])
     got, expected = tensors_of(model), plain.tensors()
     # relative for large numbers: squared gradients reach 1e8 when alpha is at its upper limit
-    scaled = {name: (got[name] / (1 + expected[name].abs()), expected[name] / (1 + expected[name].abs())) for name in expected}
     assert got.keys() == expected.keys()
-    assert max(float((one - other).abs().max()) for one, other in scaled.values()) <= 1e-10
+    assert largest((got[name] - each) / (1 + each.abs()) for name, each in expected.items()) <= 1e-10
     assert largest_difference(start, model.policy.state_dict()) > 1e-3
     # the case is the one its name promises
     if case == "alpha_at_its_upper_limit":

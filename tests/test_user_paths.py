@@ -14,15 +14,25 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import EvalCallback, LogEveryNTimesteps
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.save_util import save_to_pkl
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.sac.policies import SACPolicy
 
 from sb3_dce import OfflineBC, OfflineDCE, OfflineIQL, OfflineSAC, OfflineTD3BC, Transitions, load_dataset, run_files
 from sb3_dce.envs import SpacesEnv
-from sb3_dce.errors import ConfigError, DatasetError, DatasetIntegrityError, DatasetNotFoundError, DatasetWarning
+from sb3_dce.errors import (
+    ConfigError,
+    DatasetError,
+    DatasetFormatError,
+    DatasetIntegrityError,
+    DatasetNotFoundError,
+    DatasetWarning,
+)
 from sb3_dce.evaluation import EvaluationCallback
 from sb3_dce.networks import StandardizedExtractor
 from sb3_dce.rollouts import Rollouts
@@ -176,6 +186,52 @@ def test_buffer_of_another_model_is_refused(tmp_path: Path) -> None:
         assert other.learn(1).replay_buffer.size() == 57, "its own data are still there"
 
 
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        (spaces.Box(-2.0, 2.0, (1,)), "the buffer's actions were scaled from -2 to 2, the model's are from -1 to 1"),
+        (spaces.Box(-1.0, 1.0, (2,)), "actions of width 2, the model wants 3 and 1"),
+        (spaces.Discrete(3), "no agent for such actions"),
+        (None, "cannot be loaded as a replay buffer .*must inherit.*save_replay_buffer"),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_buffer_of_another_algorithm_that_does_not_fit_is_refused(
+    actions: spaces.Space | None, message: str, tmp_path: Path
+) -> None:
+    saved: Any = {"observations": 0}
+    if actions is not None:
+        saved = ReplayBuffer(10, spaces.Box(-1.0, 1.0, (3,)), actions, device="cpu")
+        for _ in range(10):
+            saved.add(np.ones(3), np.ones(3), np.zeros(saved.action_dim), np.ones(1), np.zeros(1), [{}])
+    save_to_pkl(tmp_path / "buffer.pkl", saved)
+    model = OfflineDCE.load_dataset(load_dataset(arrays()), seed=0, **SMALL)
+    with pytest.raises(DatasetError, match=message):
+        model.load_replay_buffer(tmp_path / "buffer.pkl")
+    assert model.learn(1).replay_buffer.size() == 57, "its own data are still there"
+
+
+def test_file_of_a_buffer_that_is_missing_or_damaged_is_said_in_words(tmp_path: Path) -> None:
+    model = OfflineDCE.load_dataset(load_dataset(arrays()), seed=0, **SMALL)
+    with pytest.raises(DatasetNotFoundError, match="no such file"):
+        model.load_replay_buffer(tmp_path / "buffer.pkl")
+    (tmp_path / "buffer.pkl").write_bytes(b"no pickle")
+    with pytest.raises(DatasetFormatError, match="cannot be loaded as a replay buffer"):
+        model.load_replay_buffer(tmp_path / "buffer.pkl")
+
+
+def test_data_whose_attaching_fails_are_attached_anew() -> None:
+    data = load_dataset(arrays())
+    model = OfflineTD3BC.load_dataset(data, seed=0, **SMALL | {"batch_size": 100})
+    with warnings.catch_warnings(), pytest.raises(DatasetWarning, match="draws rows more than once"):
+        warnings.simplefilter("error", DatasetWarning)
+        model.learn(1)
+    with pytest.warns(DatasetWarning, match="draws rows more than once"):
+        model.learn(1)
+    extractor = next(m for m in model.policy.modules() if isinstance(m, StandardizedExtractor))
+    assert np.allclose(extractor.mean, data.observations.mean(axis=0), atol=1e-6)
+
+
 def test_empty_buffer_changes_nothing(tmp_path: Path) -> None:
     load_dataset(arrays()).to_hdf5(tmp_path / "data.hdf5")
     trained = OfflineDCE.load_dataset(tmp_path / "data.hdf5", **SMALL).learn(1)
@@ -300,7 +356,7 @@ def test_agents_take_what_the_front_door_takes(sac: SAC, spaces_env: SpacesEnv) 
     assert model.learn(1).replay_buffer.size() == 60
     model.set_dataset(sac.replay_buffer)
     assert model.learn(1).replay_buffer.size() == 60
-    with pytest.raises(ConfigError):
+    with pytest.raises(ConfigError, match=r"a dataset cannot be made of float.*Give an id, a file"):
         model.set_dataset(3.5)  # type: ignore[arg-type]
 
 

@@ -87,8 +87,8 @@ REFUSALS = {
 }
 
 
-def _python(folder: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", **variables}
+def _python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     return subprocess.run([sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, text=True)
 
 
@@ -128,10 +128,9 @@ def refusals(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int, s
     """Exit code and error output of each command line of ``REFUSALS``; there is no dataset but the embedded ones."""
     pytest.importorskip("rl_zoo3")
     folder = tmp_path_factory.mktemp("refusals")
-    nowhere = {name: str(folder) for name in ("HOME", "XDG_CACHE_HOME", "D4RL_DATASET_DIR", "SB3_DCE_DATASETS")}
     (folder / "own_wrong.yml").write_text(yaml.safe_dump({DATASET: {"policy": "MlpPolicy", "expectil": 0.7}}))
     (folder / "own_other.yml").write_text(yaml.safe_dump({"hopper-medium-v2": {"policy": "MlpPolicy"}}))
-    result = _python(folder, "-c", REFUSE_ALL, json.dumps(REFUSALS), **nowhere)
+    result = _python(folder, "-c", REFUSE_ALL, json.dumps(REFUSALS))
     assert result.returncode == 0, result.stdout + result.stderr
     assert not (folder / "logs").exists()
     return json.loads(result.stdout)

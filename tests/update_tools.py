@@ -1,12 +1,12 @@
 """
-What the tests of every agent's update share: float64 models, a record of what each update was given, comparisons, and the
-checks that compiled and many-at-once execution equal the eager reference.
+What the tests of every agent's update share: float64 models, a record of what each update was given, comparisons, restated
+metrics, and the checks that compiled and many-at-once execution equal the eager reference.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import pytest
@@ -14,11 +14,15 @@ import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch.utils._pytree import tree_leaves, tree_map
 
-from sb3_dce import execution
+from sb3_dce import OfflinePBRL, execution
 from sb3_dce.base import OfflineAlgorithm
 from sb3_dce.execution import Engine
 
 needs_compiler = pytest.mark.skipif(not execution._has_compiler(), reason="needs a C++ compiler and the headers of Python")
+
+
+# a time; and what is computed once for a row of the log, not in an update (test_metrics.py)
+NOT_RESTATED = {"sec_per_1000", "epoch", "beta_pred_shift", "survival_margin"}
 
 
 class Step(NamedTuple):
@@ -47,9 +51,12 @@ def record_steps(monkeypatch: pytest.MonkeyPatch) -> list[Step]:
 def to_float64(model: OfflineAlgorithm) -> OfflineAlgorithm:
     """The model itself, computing in float64 from now on."""
     model.policy.double()
-    if getattr(model, "log_ent_coef", None) is not None:
-        model.log_ent_coef = model.log_ent_coef.detach().double().requires_grad_()
-        model.ent_coef_optimizer = th.optim.Adam([model.log_ent_coef], lr=model.lr_schedule(1))
+    for name, learned in model.learned_numbers().items():
+        if (number := getattr(model, name)) is not None:
+            setattr(model, name, number.detach().double().requires_grad_())
+            setattr(model, learned.optimizer, th.optim.Adam([getattr(model, name)], lr=learned.learning_rate))
+    if isinstance(model, OfflinePBRL):
+        model.ood_q = model.ood_q.double()
     return model
 
 
@@ -76,7 +83,47 @@ def all_tensors(model: OfflineAlgorithm) -> dict[str, th.Tensor]:
 
 def largest_difference(one: dict[str, th.Tensor], other: dict[str, th.Tensor]) -> float:
     assert one.keys() == other.keys()
-    return max(float((one[key] - other[key]).detach().abs().max()) for key in one)
+    return largest(one[key] - other[key] for key in one)
+
+
+def largest(differences: Iterable[th.Tensor]) -> float:
+    """The largest absolute entry of all; NaN if there is one anywhere, which Python's ``max`` would pass over."""
+    return float(th.stack([each.detach().abs().max().double() for each in differences]).max())
+
+
+def plain_q_metrics(values: list[th.Tensor], targets: list[th.Tensor]) -> dict[str, th.Tensor]:
+    """What every agent with critics logs of Q on the data, restated; one tensor of each for every critic."""
+    q, y = (th.cat([each.detach().flatten() for each in tensors]) for tensors in (values, targets))
+    mean = q.sum() / len(q)
+    deviation = (((q - mean) ** 2).sum() / (len(q) - 1)).sqrt()
+    errors = ((q - y) ** 2).sum() / len(q)
+    return {"q_data": mean, "q_data_std": deviation, "q_data_min": q.min(), "q_data_max": q.max(), "td_mse": errors}
+
+
+def plain_twin_gap(values: list[th.Tensor]) -> th.Tensor:
+    """Distance of the largest critic to the smallest, restated; mean over the rows."""
+    return (th.stack(values).max(dim=0).values - th.stack(values).min(dim=0).values).detach().mean()
+
+
+def plain_action_metrics(actions: th.Tensor, data_actions: th.Tensor) -> dict[str, th.Tensor]:
+    """What most agents log of the policy's actions, restated."""
+    distance = (actions - data_actions).abs().detach()
+    return {"action_dist": distance.sum() / distance.numel(), "action_sat": (actions.abs() > 0.99).double().mean()}
+
+
+def gradient_norm(parameters: Iterable[th.Tensor]) -> th.Tensor:
+    return th.stack([(each.grad**2).sum() for each in parameters if each.grad is not None]).sum().sqrt()
+
+
+def check_metrics(model: OfflineAlgorithm, steps: list[dict[str, Any]]) -> None:
+    """
+    Whatever the model has logged since its start is the mean of what a plain restatement returned for the updates that log it,
+    and the restatement leaves out no name but those of ``NOT_RESTATED``.
+    """
+    names = dict.fromkeys(name for step in steps for name in step)
+    values = {name: [float(step[name]) for step in steps if name in step] for name in names}
+    got = {name: value for name, value in model.read_metrics().items() if name not in NOT_RESTATED}
+    assert got == pytest.approx({name: sum(each) / len(each) for name, each in values.items()}, rel=1e-9, abs=1e-9)
 
 
 def check_compiled_equals_eager(

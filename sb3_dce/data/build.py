@@ -224,11 +224,11 @@ def _allocate(n_rows: int, width: int, where: str) -> np.ndarray:
 
 def _require_rows(used: np.ndarray, where: str) -> None:
     n_used = int(used.sum())
-    if len(used) < 2 or n_used == 0:
+    if n_used < 2:  # of the used rows, not of the file's: what is accepted is written as these, and read again
         raise DatasetSemanticsError(
-            f"{len(used)} rows, {n_used} usable after the episode rule",
+            f"{len(used)} rows, {n_used} usable after the episode rule; at least 2 are needed",
             where=where,
-            hint="Add next_observations, or longer episodes: without them the last row of an episode has no next observation",
+            hint="Add rows, or next_observations: without them the last row of an episode has no next observation",
             count=n_used,
         )
 

@@ -280,10 +280,10 @@ class _Download:
     def _error(self, failures: dict[str, Failed]) -> DownloadError | DatasetIntegrityError:
         kind = DatasetIntegrityError if any(failed.damaged for failed in failures.values()) else DownloadError
         lines = "".join(f"\n  {url}: {failed.what}" for url, failed in failures.items())
-        kept = self._part.stat().st_size if self._part.is_file() else 0
         hint = f"\nPut the file here by hand: {self._target}, or name a folder that has it in ${DATASETS_VARIABLE}, "
         hint += f"or another source with --mirror or ${MIRRORS_VARIABLE}."
-        if kept:
+        if any(self._resumable(url) for url in failures):
+            kept = self._part.stat().st_size
             hint += f" {kept:,} bytes have been received and are kept; the same command goes on from there."
         if kind is DatasetIntegrityError and self._expected == self._recorded:
             hint += f" If the publisher has replaced the file, delete {record_path(self._target)}."

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_dce.data.layout import as_array, read_flags
+from sb3_dce.data.layout import MATRIX_KEYS, as_array, read_flags
 from sb3_dce.data.tables import AMBIGUOUS_NAMES
 from sb3_dce.errors import ConfigError, DatasetFormatError
 
@@ -41,8 +41,8 @@ def arrays_from_episodes(episodes: Iterable[Any]) -> dict[str, np.ndarray]:
             hint="Give it for all, or leave it out for all",
             key="next_observations",
         )
-    for name in ("observations", "actions"):
-        widths = [part[name].shape[1] for part in parts]
+    for name in MATRIX_KEYS:
+        widths = [part[name].shape[1] for part in parts if name in part]
         if len(set(widths)) > 1:
             other = next(i for i, width in enumerate(widths) if width != widths[0])
             what = f"the {name} of episode {other} have width {widths[other]}, those of episode 0 {widths[0]}"
@@ -74,20 +74,14 @@ def _arrays_of(episode: Any, number: int) -> dict[str, np.ndarray]:
     if isinstance(given["observations"], Mapping):
         hint = "Flatten them into vectors; a dataset of Minari is given by its id, with flatten=True"
         raise DatasetFormatError(f"the observations of episode {number} are in parts", hint=hint, key="observations")
-    arrays = {name: as_array(value, name, f"episode {number}") for name, value in given.items() if value is not None}
-    for name in ("observations", "actions"):
-        if arrays[name].ndim == 1:
-            arrays[name] = arrays[name][:, None]
-        if arrays[name].ndim != 2:
-            what = f"the {name} of episode {number} have shape {arrays[name].shape}, wanted is (rows, width)"
-            raise DatasetFormatError(what, hint="Flatten them into vectors", key=name)
+    arrays = {name: _array_of(value, name, number) for name, value in given.items() if value is not None}
     n = len(arrays["actions"])
     if len(arrays["observations"]) == n + 1:
         arrays["next_observations"] = arrays["observations"][1:]
         arrays["observations"] = arrays["observations"][:-1]
     for name in _OTHER_NAMES:
         flags = arrays.get(name, np.zeros(n))
-        if flags.ndim == 0:  # of the whole episode
+        if flags.ndim == 0:
             flags = np.append(np.zeros(max(0, n - 1)), flags)
         arrays[name] = read_flags(flags, name, f"episode {number}")
     lengths = {name: len(array) for name, array in arrays.items()}
@@ -96,3 +90,19 @@ def _arrays_of(episode: Any, number: int) -> dict[str, np.ndarray]:
         raise DatasetFormatError(f"episode {number} has different numbers of rows: {shown}", hint="One row per step")
     arrays["timeouts"][-1] |= not arrays["terminals"][-1]
     return arrays
+
+
+def _array_of(value: Any, name: str, number: int) -> np.ndarray:
+    """Shape (rows, width), of rewards and flags (rows,); a flag of the whole episode stays without dimensions."""
+    array, is_matrix = as_array(value, name, f"episode {number}"), name in MATRIX_KEYS
+    if is_matrix and array.ndim == 1:
+        array = array[:, None]
+    elif not is_matrix and array.shape[1:] == (1,):
+        array = array[:, 0]
+    if array.ndim == (2 if is_matrix else 1) or (array.ndim == 0 and name in _OTHER_NAMES):
+        return array
+    wanted, hint = ("(rows, width)", "Flatten them into vectors") if is_matrix else ("(rows,)", "Give one number per step")
+    if array.ndim == 0:
+        hint = "A single step? Give one dictionary of arrays per episode, or one of all steps"
+    what = f"the {name} of episode {number} have shape {array.shape}, wanted is {wanted}"
+    raise DatasetFormatError(what, hint=hint, key=name)

@@ -226,3 +226,22 @@ def find_shift(rows: np.ndarray, layout: RowLayout, inner: np.ndarray) -> int | 
         if len(at) and equal.mean() > 0.5:
             return shift
     return None
+
+
+def take_turns(rows: np.ndarray, layout: RowLayout, inner: np.ndarray, n_environments: int) -> bool:
+    """
+    Whether several environments take turns in the rows. Displaced next observations look the same but at the ends of
+    episodes: only here each step is followed by the next one of its environment up to the marked end, and no further.
+
+    :param rows: row matrix of :class:`~sb3_dce.data.layout.RowLayout`, shape (n, width)
+    :param layout: its columns
+    :param inner: rows that are not the last of their episode
+    :param n_environments: number of environments, less than n
+    :return: False also where no end is marked that would tell one from the other
+    """
+    inner = inner[: len(rows) - n_environments]
+    follows = np.empty(len(inner), dtype=bool)
+    for block in row_blocks(len(inner)):
+        later = rows[block.start + n_environments : block.stop + n_environments, layout.observations]
+        follows[block] = (rows[block, layout.next_observations] == later).all(axis=1)
+    return not inner.all() and np.array_equal(follows, inner)

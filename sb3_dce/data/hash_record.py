@@ -12,6 +12,7 @@ from pathlib import Path
 from sb3_dce.data.catalog import spec_of_file
 from sb3_dce.data.file_checks import read_head
 from sb3_dce.data.hashes import file_sha256
+from sb3_dce.data.locate import require_file
 from sb3_dce.errors import ConfigError, DatasetIntegrityError
 from sb3_dce.files import write_text
 
@@ -67,9 +68,9 @@ def verify_hash(path: Path, expected: str, hint: str) -> None:
     :param path: existing file
     :param expected: SHA-256, 64 hexadecimal digits
     :param hint: what to do if it is another one
-    :raises DatasetIntegrityError: if it is another one
+    :raises DatasetError: if it is another one, or cannot be read
     """
-    if (got := file_sha256(path)) != expected:
+    if (got := file_sha256(require_file(path))) != expected:  # which does not wait for a pipe
         raise DatasetIntegrityError(f"SHA-256 is {got}, expected {expected}", where=str(path), hint=hint, path=path)
 
 

@@ -10,9 +10,9 @@ follows all of this silently. Here such files are refused before the first numbe
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
-from itertools import product
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from math import prod
+from operator import floordiv
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
@@ -30,6 +30,7 @@ ALLOWED_FILTERS = {1: "gzip", 2: "shuffle", 3: "fletcher32", 32000: "lzf"}
 DEFAULT_MAX_BYTES = 8 * 2**30
 MAX_DEPTH = 16
 MAX_OBJECTS = 10_000
+MAX_CHUNKS = 2**22  # each of them is looked at
 # Honest arrays exceed any flat ratio (a million False compress 411:1), so only large ones are judged by it.
 MAX_RATIO = 200
 RATIO_APPLIES_ABOVE = 256 * 2**20
@@ -332,11 +333,27 @@ def _missing_part(dataset: h5py.Dataset, n_stored: int) -> str | None:
     if dataset.chunks is None:
         n_bytes = dataset.size * dataset.dtype.itemsize
         return f"{n_stored:,} of {n_bytes:,} bytes are stored" if n_stored < n_bytes else None
-    starts = [range(0, rows, size) for rows, size in zip(dataset.shape, dataset.chunks, strict=True)]
-    n_chunks, found = prod(map(len, starts)), dataset.id.get_num_chunks()
-    if found >= n_chunks:  # each has to be where reading looks for it
-        found = sum(dataset.id.get_chunk_info_by_coord(start).size > 0 for start in product(*starts))
+    counts = _chunk_counts(dataset.shape, dataset.chunks)
+    n_chunks, found = prod(counts), dataset.id.get_num_chunks()
+    if found >= n_chunks:
+        found = _chunks_in_place(dataset, counts)
     return f"{found:,} of {n_chunks:,} chunks are stored" if found < n_chunks else None
+
+
+def _chunk_counts(shape: Sequence[int], chunks: Sequence[int]) -> tuple[int, ...]:
+    return tuple(-(-length // size) for length, size in zip(shape, chunks, strict=True))
+
+
+def _chunks_in_place(dataset: h5py.Dataset, counts: tuple[int, ...]) -> int:
+    """Number of chunks that are where reading looks for them; in one pass, since asking for one goes through the index."""
+    found, sizes = np.zeros(counts, dtype=bool), dataset.chunks
+
+    def note(chunk: Any) -> None:
+        if chunk.size > 0:
+            found[tuple(map(floordiv, chunk.chunk_offset, sizes))] = True
+
+    dataset.id.chunk_iter(note)
+    return int(found.sum())
 
 
 def _check_link(link: Any, key: str, path: Path) -> None:
@@ -356,11 +373,13 @@ def _check_link(link: Any, key: str, path: Path) -> None:
 
 
 def _check_storage(dataset: h5py.Dataset, name: str, path: Path) -> None:
-    """Refuse arrays whose bytes lie in other files or need a filter that is not built in."""
+    """Refuse arrays whose bytes lie in other files, need a filter that is not built in, or lie in too many pieces."""
     plan = dataset.id.get_create_plist()  # asked once: h5py's own properties make it anew each time
     external = dataset.external if plan.get_external_count() else None
     codes = [plan.get_filter(i)[0] for i in range(plan.get_nfilters())]
     unknown = [code for code in codes if code not in ALLOWED_FILTERS]
+    is_chunked = plan.get_layout() == h5py.h5d.CHUNKED
+    n_chunks = prod(_chunk_counts(dataset.shape, plan.get_chunk())) if is_chunked and dataset.shape else 1
     if external:
         what, hint = f"its numbers lie in another file, {external[0][0]!r}", "Copy the data into the file itself"
     elif plan.get_layout() == h5py.h5d.VIRTUAL:
@@ -368,6 +387,8 @@ def _check_storage(dataset: h5py.Dataset, name: str, path: Path) -> None:
     elif unknown:
         allowed = ", ".join(ALLOWED_FILTERS.values())
         what, hint = f"needs HDF5 filter {unknown[0]}, allowed are {allowed}", "Rewrite with gzip"
+    elif n_chunks > MAX_CHUNKS:
+        what, hint = f"consists of {n_chunks:,} chunks, the limit is {MAX_CHUNKS:,}", "Rewrite it with larger chunks"
     else:
         return
     raise DatasetSecurityError(what, where=f"{path}, key {name}", hint=hint, path=path, key=name)

@@ -234,7 +234,8 @@ def _check_keys(sources: Mapping[str, ArraySource], where: str, found: list[str]
 
 
 def _check_types(sources: Mapping[str, ArraySource], where: str) -> None:
-    bad = {key: source.dtype for key, source in sources.items() if source.dtype.kind not in "fiub"}
+    types = {key: source.dtype for key, source in sources.items()}
+    bad = {key: dtype for key, dtype in types.items() if dtype.kind not in "fiub" or dtype.itemsize > 8}  # no float128
     if not bad:
         return
     described = [

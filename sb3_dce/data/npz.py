@@ -88,11 +88,13 @@ def flag_from_npz(path: str | PathLike[str], key: str) -> bool:
 
 def _small_member(path: str | PathLike[str], key: str) -> np.ndarray | None:
     """A member as an array, empty if it is large or none; ``None`` if it is not there."""
-    with _zip_errors(Path(path)), zipfile.ZipFile(path) as archive:
+    path = Path(path)
+    with translated_errors(path), _zip_errors(path), zipfile.ZipFile(path) as archive:
         infos = {info.filename: info for info in archive.infolist()}
         info = infos.get(f"{key}.npy")
         if info is None:
             return None
+        _check_method(info, path, key)
         with archive.open(info) as stream:
             head = io.BytesIO(stream.read(_MAX_TEXT_BYTES))
     try:
@@ -198,10 +200,14 @@ def _select(infos: Iterable[zipfile.ZipInfo], path: Path, max_bytes: int) -> dic
         if info.file_size > RATIO_APPLIES_ABOVE and info.file_size > MAX_RATIO * info.compress_size:
             what = f"declares {info.file_size:,} bytes but stores {info.compress_size:,}; data do not compress so well"
             raise _error(DatasetSecurityError, what, path, key, "Rewrite the file with numpy.savez if it is honest")
-        if info.compress_type not in _METHODS or info.flag_bits & 1:
-            what = "encrypted, or compressed in a way NumPy does not use"
-            raise _error(DatasetFormatError, what, path, key, "Write the arrays again with numpy.savez")
+        _check_method(info, path, key)
     return members
+
+
+def _check_method(info: zipfile.ZipInfo, path: Path, key: str) -> None:
+    if info.compress_type not in _METHODS or info.flag_bits & 1:
+        what = "encrypted, or compressed in a way NumPy does not use"
+        raise _error(DatasetFormatError, what, path, key, "Write the arrays again with numpy.savez")
 
 
 def _is_odd(name: str) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 
 from sb3_dce.data.catalog import DatasetSpec
 from sb3_dce.data.columns import ColumnSummary
-from sb3_dce.data.episodes import MAX_JUMP_SHARE, Episodes, find_jumps, find_shift
+from sb3_dce.data.episodes import MAX_JUMP_SHARE, Episodes, find_jumps, find_shift, take_turns
 from sb3_dce.data.hashes import row_hashes
 from sb3_dce.data.layout import WIDE_BLOCK_ROWS, RowLayout, row_blocks
 from sb3_dce.data.records import CheckName, Finding, ReadOptions
@@ -237,20 +237,27 @@ def check_order(
         findings.note("next observations", text, n_jumps)
         return jumps
     shift = find_shift(rows, layout, inner)
-    if shift is not None:
+    turns = 1 + shift if shift is not None and shift > 0 else 0
+    if shift is not None and not (turns and take_turns(rows, layout, inner, turns)):
+        hint = "Shift the array back, or leave it out"
+        if turns:  # to leave it out would make another environment's observation of it
+            hint = f"Shift the array back; or, if {turns} environments take turns, give one after the other: array[i::{turns}]"
         raise DatasetSemanticsError(
             f"{share:.0%} of the next observations are not the next row's observation; next_observations[i] is "
             f"observations[i + {1 + shift}], a shift of {shift:+d} rows",
             check="next observations",
             where=f"{where}, key next_observations",
-            hint="Shift the array back, or leave it out",
+            hint=hint,
             key="next_observations",
             count=n_jumps,
         )
+    cause = "if the rows are shuffled"
+    if shift is not None:
+        cause = f"{turns} environments take turns, and until they are given one after the other"
     findings.warning(
         "next observations",
-        f"{share:.0%} of the next observations are not the next row's observation: if the rows are shuffled, returns and "
-        "lengths of episodes mean nothing",
+        f"{share:.0%} of the next observations are not the next row's observation: {cause}, returns and lengths of episodes "
+        "mean nothing",
     )
     return jumps if timeouts is None else None
 

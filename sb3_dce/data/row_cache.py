@@ -29,7 +29,7 @@ from sb3_dce.data.build import BuiltRows
 from sb3_dce.data.catalog import DatasetSpec
 from sb3_dce.data.hashes import data_state, file_sha256
 from sb3_dce.data.layout import RowLayout
-from sb3_dce.data.locate import cache_folder, embedded_folder
+from sb3_dce.data.locate import cache_folder, embedded_folder, require_file
 from sb3_dce.data.records import DatasetInfo, Finding, ReadOptions
 from sb3_dce.errors import CheckpointError, ConfigError, DatasetWarning
 from sb3_dce.files import write_atomically
@@ -57,8 +57,8 @@ def cached_rows(
         return build()
     try:
         before = data_state(path)
-        key = _key_of(path, spec, options, reader)
-    except (OSError, TypeError, ValueError):  # no such file, or impossible options: the reader has the better message
+        key = _key_of(require_file(path), spec, options, reader)
+    except (OSError, TypeError, ValueError):  # no file, or impossible options: the reader has the better message
         return build()
     name = f"{path.name}.{hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]}"
     for folder in _folders(path):

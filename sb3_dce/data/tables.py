@@ -11,7 +11,7 @@ import csv
 import os
 from array import array
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import count
 from operator import itemgetter
 from os import PathLike
@@ -150,7 +150,7 @@ def _find_columns(names: Sequence[Any], columns: Columns | None, where: str) -> 
             f"column {twice[0]!r} is there {names.count(twice[0])} times", where=where, hint="Rename one", key=str(twice[0])
         )
     named = _by_mapping(names, columns or {}, where)
-    found = _by_name(names, where) | named
+    found = _by_name(names, named, where) | named
     if {"terminals", "timeouts"} <= found.keys() and EPISODES not in named:
         found.pop(EPISODES, None)  # the flags say it; such a number may begin again in each of several runs
     missing = [key for key in REQUIRED_KEYS if key not in found and not (key == "terminals" and EPISODES in found)]
@@ -169,12 +169,13 @@ def _find_columns(names: Sequence[Any], columns: Columns | None, where: str) -> 
     )
 
 
-def _by_name(names: Sequence[Any], where: str) -> dict[str, list[int]]:
+def _by_name(names: Sequence[Any], named: Collection[str], where: str) -> dict[str, list[int]]:
+    """Position of the columns of each key but those that the user has named, whose other columns are none of its own."""
     numbered: dict[str, dict[int, int]] = {}
     for position, name in enumerate(names):
         stem, number = _stem_and_number(name)
         key = _KEY_OF_NAME.get(stem)
-        if key is None or (number is not None and key not in MATRIX_KEYS):
+        if key is None or key in named or (number is not None and key not in MATRIX_KEYS):
             continue
         others = numbered.setdefault(key, {})
         if key == EPISODES and others:  # one of these names is enough
@@ -398,7 +399,7 @@ def _by_record(
                 cells[n] = known.setdefault(cells[n].strip(), str(len(known)))
         numbers = numbers_of(cells)
         if numbers is None or any(numbers[n] not in (0.0, 1.0) for n in flags):
-            raise _bad_cell(record, names, cells_of_keys, _Line(path, records.line))
+            raise _bad_cell(record, cells, names, cells_of_keys, _Line(path, records.line))
         values.extend(numbers)
     if not values:
         raise _Line(path, 2).fault("no line of data", "Record some steps first")
@@ -406,10 +407,14 @@ def _by_record(
 
 
 def _bad_cell(
-    record: Sequence[str], names: Sequence[str], cells_of_keys: Sequence[tuple[str, int]], line: _Line
+    record: Sequence[str],
+    cells: Sequence[str],
+    names: Sequence[str],
+    cells_of_keys: Sequence[tuple[str, int]],
+    line: _Line,
 ) -> DatasetFormatError:
-    """The error for the first bad cell of a record that has one."""
-    key, i = next((key, i) for key, i in cells_of_keys if not _is_good(record[i], key))
+    """The error for the first bad cell of a record that has one; ``cells`` are the wanted ones, blanks replaced."""
+    key, i = next(place for place, cell in zip(cells_of_keys, cells, strict=True) if not _is_good(cell, place[0]))
     cell = record[i]
     what, hint = f"{cell[:60]!r} is not a number", "Write numbers with a decimal point, such as -0.5 or 1e-3"
     if not cell.strip():

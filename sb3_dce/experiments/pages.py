@@ -6,13 +6,14 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
+from sb3_dce.errors import ConfigError
 from sb3_dce.experiments.claims import claim_table, own_table_facts
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.judging import CLEARLY, Verdict
 from sb3_dce.experiments.reports import Report, count
 from sb3_dce.experiments.tables import parts_of
 from sb3_dce.experiments.text_table import TextTable
-from sb3_dce.files import write_text
+from sb3_dce.files import check_writable, write_text
 
 HEADINGS = {
     "scores": "Normalised scores",
@@ -30,6 +31,25 @@ HEADINGS = {
     "rows": "The 23 rows",
     "common": "Common configuration",
 }
+# The first line of a page, by which it is known.
+TITLE = "# Results"
+
+
+def check_page(path: Path) -> None:
+    """
+    Refuse a page that could not be written, or would replace another file, before the work that it tells of.
+
+    :param path: page to be written later
+    :raises CheckpointError: if it cannot be written
+    :raises ConfigError: if the file is there and is no results page
+    """
+    check_writable(path)
+    if path.is_file():
+        with path.open("rb") as stream:
+            first = stream.readline(len(TITLE) + 2).decode("utf-8", errors="replace").strip()
+        if first != TITLE:
+            hint = "Choose another name, or delete the file."
+            raise ConfigError("this file exists and is no results page", where=str(path), key="--page", hint=hint)
 
 
 def write_page(
@@ -50,7 +70,7 @@ def write_page(
     judged = {name: report.verdicts for name, report in reports.items()}
     every = [verdict for found in judged.values() for verdict in found]
     parts = [
-        "# Results",
+        TITLE,
         f"Made from the result rows in `{link}rows/` by `{command}`; no score of ours is typed by hand.",
         "Data whose names end in `-sb3` are made with this package. They stand in for D4RL's sets and are not these: scores "
         "on them cannot be compared with published ones, which stand beside them in columns of their own, under the D4RL id "

@@ -31,11 +31,10 @@ from sb3_dce.experiments.grid import (
     load_experiment,
     present_datasets,
 )
-from sb3_dce.experiments.pages import write_page
+from sb3_dce.experiments.pages import check_page, write_page
 from sb3_dce.experiments.reports import Report, count, make_report
 from sb3_dce.experiments.run import execute, is_complete
 from sb3_dce.experiments.tables import parts_of
-from sb3_dce.files import check_writable
 from sb3_dce.hyperparams import full_name
 from sb3_dce.launch import raise_first
 from sb3_dce.locking import exclusive
@@ -184,7 +183,7 @@ def _check_request(request: Request) -> None:
         if next(folder.rglob("config.yml"), None) is None:
             raise ConfigError("no runs below the folder", where=str(folder), key="--import", hint="Name one that train wrote.")
     if request.page is not None:
-        check_writable(request.page)
+        check_page(request.page)
 
 
 def hash_here(dataset_id: str) -> str | None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import json
 import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -123,7 +122,7 @@ def read_npz_policy(path: Path) -> tuple[MLPPolicy, PolicyFacts]:
         with np.load(path, allow_pickle=False) as data:
             arrays = {name: data[name] for name in data.files}
         policy, meta = _policy_of_arrays(arrays)
-    except (KeyError, ValueError, TypeError, IndexError, OSError, zipfile.BadZipFile, zlib.error) as error:
+    except Exception as error:  # whatever NumPy raises on a damaged archive or header
         raise CheckpointError(
             f"not a policy ({type(error).__name__}: {error})",
             where=str(path),
@@ -172,6 +171,7 @@ def _policy_of_arrays(arrays: dict[str, np.ndarray]) -> tuple[MLPPolicy, dict[st
     n_layers = sum(name[:1] == "w" and name[1:].isdigit() for name in arrays)
     layers: list[Layer] = [(arrays[f"w{i}"].T, arrays[f"b{i}"]) for i in range(n_layers)]
     _check_chain(layers)
+    _check_vectors(arrays, len(layers[0][0]), len(layers[-1][1]))
     box = np.ones(len(layers[-1][1]))
     if "meta" not in arrays:
         weight, bias = (np.asarray(part, dtype=np.float64) for part in layers[-1])
@@ -208,6 +208,17 @@ def _check_chain(layers: list[Layer]) -> None:
         before = weight.shape[0] if number == 0 else layers[number - 1][0].shape[1]
         if weight.shape != (before, len(bias)):
             raise ValueError(f"layer {number} has weights {weight.T.shape} and {len(bias)} biases, and gets {before} inputs")
+
+
+def _check_vectors(arrays: dict[str, np.ndarray], obs_dim: int, act_dim: int) -> None:
+    """Each must have a number for every entry, which broadcasting would not ask for; a variance is no negative one."""
+    widths = dict.fromkeys(("obs_mean", "obs_var", "in_shift", "in_scale"), obs_dim)
+    widths |= dict.fromkeys(("out_shift", "out_scale", "log_std"), act_dim)
+    for name, width in widths.items():
+        if name in arrays and arrays[name].shape != (width,):
+            raise ValueError(f"{name} has shape {arrays[name].shape}, wanted is ({width},)")
+    if "obs_var" in arrays and (arrays["obs_var"] + arrays["norm_eps"] <= 0.0).any():
+        raise ValueError("obs_var plus norm_eps must be positive")
 
 
 def _from_zip(

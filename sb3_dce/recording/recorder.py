@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing as mp
 import os
 import platform
 import re
@@ -10,7 +9,7 @@ import shutil
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
@@ -30,7 +29,7 @@ from sb3_dce.envs import dataset_of_env
 from sb3_dce.errors import ConfigError, SB3DCEError
 from sb3_dce.files import check_writable
 from sb3_dce.numpy_policy import NumpyPolicy
-from sb3_dce.processes import end_workers, prepare_worker
+from sb3_dce.processes import end_workers, prepare_worker, starting_workers, worker_pool
 from sb3_dce.recording.episodes import Arrays, EpisodeRunner, RecordingSpec
 from sb3_dce.recording.parts import Parts
 
@@ -310,16 +309,16 @@ def _chunks(runner: EpisodeRunner, first: int, workers: int) -> Generator[tuple[
 
 
 def _parallel_chunks(runner: EpisodeRunner, first: int, workers: int) -> Iterator[tuple[Arrays, list[int]]]:
-    context = mp.get_context("spawn")
     size, rows, episodes = runner.width, 0, 0
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_prepare, initargs=(runner.spec, runner.policy))
+    pool = worker_pool(workers, _prepare, runner.spec, runner.policy)
     pending: deque[Future[tuple[Arrays, list[int]]]] = deque()
     try:
         with _one_thread_each():
             while True:
                 # twice as many tasks as workers: none waits while the oldest one is still running
                 while len(pending) < 2 * workers:
-                    pending.append(pool.submit(_run_many, first, size))
+                    with starting_workers():
+                        pending.append(pool.submit(_run_many, first, size))
                     first += size
                 arrays, lengths = pending.popleft().result()
                 rows, episodes = rows + len(arrays["rewards"]), episodes + len(lengths)
