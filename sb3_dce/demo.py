@@ -164,7 +164,7 @@ def _seconds(results: list[dict[str, Any]], algo: str) -> float:
 
 def _print_table(table: dict[str, list[float]], seconds: dict[str, float], n_seeds: int, console: Console) -> None:
     view = Table(box=None, header_style="bold")
-    for title in ("agent", "return", "normalised score", "over", "train + eval s"):
+    for title in ("agent", "return", "normalised score", "over", "seconds"):
         view.add_column(title, justify="left" if title in ("agent", "over") else "right")
     over = {"random": f"{N_EVAL_EPISODES} episodes", "data": f"{len(table['data'])} episodes of the data"}
     for name, values in table.items():

@@ -102,7 +102,7 @@ def show_results(algo: str, results: list[dict[str, Any]], console: Console) -> 
     :param console: where to print
     """
     table = Table(box=None, header_style="bold")
-    for title in ("agent", "seed", "return (last evaluation)", "normalised score", "train + eval s"):
+    for title in ("agent", "seed", "return (last evaluation)", "normalised score", "seconds"):
         table.add_column(title, justify="left" if title == "agent" else "right")
     for row in results:
         if row["returns"] is None:
