@@ -127,8 +127,7 @@ class OfflineReplayBuffer(ReplayBuffer):
         _refuse_widths((self.obs_dim, self.action_dim), wanted, where)
         own, other = self.action_space, action_space
         assert isinstance(own, spaces.Box) and isinstance(other, spaces.Box)
-        pairs = ((own.low, other.low), (own.high, other.high))
-        if not all(np.allclose(np.ravel(a), np.ravel(b), rtol=1e-5) for a, b in pairs):
+        if not _same_bounds(own, other.low, other.high):
             raise DatasetSemanticsError(
                 f"the buffer's actions were scaled from {own.low.min():g} to {own.high.max():g}, the model's are from "
                 f"{other.low.min():g} to {other.high.max():g}",
@@ -155,8 +154,7 @@ class OfflineReplayBuffer(ReplayBuffer):
         """Replay buffers and policies keep actions in [-1, 1]; taken for the environment's units they are too small."""
         space, info = self.action_space, transitions.info
         assert isinstance(space, spaces.Box)
-        bounds = ((space.low, info.action_space_low), (space.high, info.action_space_high))
-        if not all(np.allclose(np.ravel(own), theirs, rtol=1e-5) for own, theirs in bounds):
+        if not _same_bounds(space, info.action_space_low, info.action_space_high):
             warnings.warn(
                 f"the environment has actions from {space.low.min():g} to {space.high.max():g}, the data were read as actions "
                 f"from {info.action_space_low.min():g} to {info.action_space_high.max():g}. If they are in the environment's "
@@ -326,6 +324,11 @@ class OfflineReplayBuffer(ReplayBuffer):
         state["rows"] = None if self.rows is None else self.rows.cpu()
         state["_device"] = th.device("cpu")
         return state
+
+
+def _same_bounds(space: spaces.Box, low: np.ndarray, high: np.ndarray) -> bool:
+    pairs = ((space.low, low), (space.high, high))
+    return all(np.allclose(np.ravel(own), np.ravel(theirs), rtol=1e-5) for own, theirs in pairs)
 
 
 def _refuse_widths(got: tuple[int, int], wanted: tuple[int, int], where: str) -> None:

@@ -302,13 +302,18 @@ def test_second_ctrl_c_leaves_no_member_half_of_another_moment(
         assert largest_difference(all_tensors(one), all_tensors(other)) == 0.0
 
 
+SUBMIT = EvaluationPool.submit
+
+
+def beside(self: EvaluationPool, model: Any, rollouts: Any, seed: int, parts: int = 1) -> PendingEpisodes:
+    """An evaluation that is collected later, as one of a worker, though this process plays it."""
+    return SUBMIT(EvaluationPool(0), model, rollouts, seed)
+
+
 def test_interruption_without_a_pending_evaluation_leaves_what_it_can_be_made_from(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    submit, train = EvaluationPool.submit, Population.train
-
-    def beside(self: EvaluationPool, model: Any, rollouts: Any, seed: int, parts: int = 1) -> Any:
-        return submit(EvaluationPool(0), model, rollouts, seed)
+    train = Population.train
 
     def lost(self: PendingEpisodes) -> Any:
         raise EvaluationFailedError("its worker was killed", hint="Take fewer workers.")
@@ -340,10 +345,7 @@ def test_population_ends_when_all_have_diverged(tmp_path: Path) -> None:
 def test_evaluation_in_a_worker_is_kept_if_the_run_is_killed_at_its_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    submit, save = EvaluationPool.submit, BatchedRuns._save
-
-    def beside(self: EvaluationPool, model: Any, rollouts: Any, seed: int, parts: int = 1) -> Any:
-        return submit(EvaluationPool(0), model, rollouts, seed)
+    save = BatchedRuns._save
 
     def killed(self: BatchedRuns, population: Any, seconds: float) -> None:
         save(self, population, seconds)
@@ -360,11 +362,8 @@ def test_evaluation_in_a_worker_is_kept_if_the_run_is_killed_at_its_end(
 
 
 def test_evaluation_that_is_waited_for_during_an_interruption_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    submit, result = EvaluationPool.submit, PendingEpisodes.result
+    result = PendingEpisodes.result
     interruptions = [KeyboardInterrupt()]
-
-    def beside(self: EvaluationPool, model: Any, rollouts: Any, seed: int, parts: int = 1) -> Any:
-        return submit(EvaluationPool(0), model, rollouts, seed)
 
     def interrupted(self: PendingEpisodes) -> Any:
         if interruptions:

@@ -293,8 +293,9 @@ def plan_runs(experiment: Experiment, scale: Scale, request: Request) -> list[Pl
     if unknown := sorted(wanted - headings - algos):
         hint = f"It has {'; '.join(sorted(headings))}, or all forms of {', '.join(sorted(algos))}."
         raise ConfigError(f"{experiment.id} has no agent {unknown[0]!r}", key="--agents", hint=hint)
-    needed = {run.needs for run in planned if {run.variant, run.spec.algo} & wanted}
-    return [run for run in planned if {run.variant, run.spec.algo} & wanted or run.spec.folder in needed]
+    chosen = [run for run in planned if {run.variant, run.spec.algo} & wanted]
+    needed = {run.needs for run in chosen}
+    return [run for run in planned if run in chosen or run.spec.folder in needed]
 
 
 def _with_precision(spec: RunSpec, precision: str) -> RunSpec:
