@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import re
 import shlex
@@ -27,7 +28,7 @@ from update_tools import all_tensors, largest_difference
 from sb3_dce import OfflineDCE, population_runs
 from sb3_dce.data import resolve, write_hdf5
 from sb3_dce.data.locate import DATASETS_VARIABLE, search
-from sb3_dce.dce_probe import PROBE_BETAS, OfflineDCEProbe
+from sb3_dce.dce_probe import PROBE_BETAS, OfflineDCEProbe, probe_name, rank_correlation
 from sb3_dce.errors import ConfigError, DivergenceError
 from sb3_dce.experiments import results
 from sb3_dce.experiments import run as experiment_run
@@ -418,6 +419,33 @@ def test_probe_is_sac_with_v_and_its_critics_differ_in_beta_alone() -> None:
     falling = [metrics[f"probe{beta}_data"] for beta in (0, *PROBE_BETAS)]
     assert falling == sorted(falling, reverse=True) and metrics["probe0_data"] == pytest.approx(metrics["q_data"])
     assert metrics["probe4_min"] <= metrics["probe4_max"]
+
+
+def test_probe_says_how_alike_its_critics_order_the_actions_of_the_data() -> None:
+    probe = OfflineDCEProbe.load_dataset(TINY, seed=0, device="cpu", execution="eager", **QUICK)
+    probe.learn(60, log_interval=None)
+    probe.read_metrics()  # what was measured so far
+    before, batch = copy.deepcopy(probe.policy), probe.replay_buffer.gather(th.arange(16))  # type: ignore[union-attr]
+    probe.draw_rows = lambda generator, batch_size: th.arange(batch_size)  # type: ignore[method-assign]
+    probe.learn(1, log_interval=None, reset_num_timesteps=False)
+    measured = probe.read_metrics()
+    advantages = {}
+    with th.no_grad():
+        for beta in (0, *PROBE_BETAS):
+            critic, value_net = (getattr(before, probe_name(network, beta)) for network in ("critic", "value_net"))
+            v = value_net(batch.observations)
+            advantages[beta] = [(q - v).flatten().numpy() for q in critic(batch.observations, batch.actions)]
+    ranks = {beta: [np.argsort(np.argsort(a)) for a in both] for beta, both in advantages.items()}
+    for beta in PROBE_BETAS:
+        alike = [np.corrcoef(a, b)[0, 1] for a, b in zip(ranks[beta], ranks[0], strict=True)]
+        assert measured[f"probe{beta}_rank"] == pytest.approx(np.mean(alike), abs=1e-5)
+    assert measured["probe0_rank"] == pytest.approx(np.corrcoef(*ranks[0])[0, 1], abs=1e-5)
+
+
+def test_rank_correlation_of_equal_reversed_and_single_rows() -> None:
+    x = th.tensor([3.0, -1.0, 10.0, 4.0], dtype=th.float64)
+    assert [float(rank_correlation(x, y)) for y in (x.exp(), -x, x[[1, 0, 2, 3]])] == pytest.approx([1.0, -1.0, 0.8])
+    assert float(rank_correlation(x[:1], x[:1])) == 1.0
 
 
 def test_probe_critics_equal_those_of_a_dce_run_while_the_actor_stands_still() -> None:

@@ -55,25 +55,28 @@ def panel_curves(evidence: Evidence, panel: Panel) -> dict[str, tuple[pd.DataFra
             return {}
         if panel.lines:
             probe = experiment.variant(names[0])
-            curves = {f"beta {b}": (probe_difference(evidence, probe, dataset_id, panel.metric, b), None) for b in panel.lines}
+            curves = {f"beta {b}": (probe_curve(evidence, probe, dataset_id, panel.metric, b), None) for b in panel.lines}
         else:
             for name in names:
                 curves[name] = _line(evidence, panel, experiment.variant(name), dataset_id)
     return {name: (curve, theory) for name, (curve, theory) in curves.items() if curve.notna().any(axis=None)}
 
 
-def probe_difference(evidence: Evidence, probe: Variant, dataset_id: str, metric: str, beta: int) -> pd.DataFrame:
+def probe_curve(evidence: Evidence, probe: Variant, dataset_id: str, metric: str, beta: int) -> pd.DataFrame:
     """
-    Q that the critics of one beta give the probed actions, less the Q that the metric compares it with.
+    What a panel shows of the critics of one beta: mostly Q of the probed actions, less the Q it is compared with.
 
     :param evidence: rows of the probe
     :param probe: its variant
     :param dataset_id: data
-    :param metric: "probe_policy" (against the critics with beta 0), "probe_max" or "probe_min" (against the data's actions)
+    :param metric: "probe_policy" (against the critics with beta 0), "probe_max" or "probe_min" (against the data's actions);
+        "probe_rank" is shown as logged: how alike beta and beta 0 order the data's actions, for 0 how alike its two critics do
     :param beta: of the critics, one of ``PROBE_BETAS`` or 0
-    :return: difference of Q, reward units, steps by seeds
+    :return: reward units, or a correlation; steps by seeds
     """
     assert beta in (0, *PROBE_BETAS)
+    if metric == "probe_rank":
+        return evidence.curve(probe, dataset_id, f"probe{beta}_rank")
     if metric == "probe_policy":
         return evidence.curve(probe, dataset_id, f"probe{beta}_policy") - evidence.curve(probe, dataset_id, "probe0_policy")
     kind = metric.removeprefix("probe_")

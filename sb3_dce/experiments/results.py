@@ -52,7 +52,7 @@ PLAN_KEY = ["dataset", "agent", "config_hash", "n_updates", "seed"]
 TIMING = "run-times"
 # Diagnostics that figures, verdicts and the search for causes read, by their names in the log.
 CURVES = ("q_data", "q_policy", "value", "gap_td", "ent_coef", "beta_eff", "survival_margin", "action_dist", "entropy", "adv")
-PROBE_CURVE = re.compile(r"probe\d+_(data|policy|init|best|max|min)")
+PROBE_CURVE = re.compile(r"probe\d+_(data|policy|init|best|max|min|rank)")
 # A curve of diagnostics has at most POINTS points, each the mean since the last; a short run has wider gaps than FINEST steps
 # only for FEWEST_POINTS.
 POINTS, FEWEST_POINTS, FINEST = 100, 25, 2000

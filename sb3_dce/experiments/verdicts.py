@@ -15,7 +15,7 @@ import numpy as np
 from sb3_dce.configuration import row_of
 from sb3_dce.dce_probe import PROBE_BETAS
 from sb3_dce.execution import UPDATES_WORTH_COMPILING
-from sb3_dce.experiments.curves import probe_difference, view_of
+from sb3_dce.experiments.curves import probe_curve, view_of
 from sb3_dce.experiments.evidence import GAMMA, TAU, Evidence, of_seeds_that_ended
 from sb3_dce.experiments.grid import source_of
 from sb3_dce.experiments.judging import (
@@ -207,24 +207,44 @@ def _bounds(evidence: Evidence) -> list[Verdict]:
 
 def _ood(evidence: Evidence) -> list[Verdict]:
     evidence = evidence.among(["probe"])
-    dataset_id, probe = evidence.id_of(None), evidence.experiment.variant("probe")
     found = []
     for metric, text in (
         ("probe_policy", "Q of the policy's actions, less that of beta 0, is lower with a larger beta"),
         ("probe_max", "max OOD Q - in-data Q is lower with a larger beta"),
         ("probe_min", "min OOD Q - in-data Q is lower with a larger beta"),
     ):
-        values: Values | None = scoped(evidence)
-        for beta in (0, *PROBE_BETAS):
-            value = None
-            if dataset_id is not None:
-                value = evidence.tail_mean(probe_difference(evidence, probe, dataset_id, metric, beta), dataset_id)
-            if value is None or values is None:
-                values = None
-                continue
-            values[f"beta {beta}"] = value
+        values = _probe_values(evidence, metric)
         found.append(judge(text, f"ordered by beta ({TENTH})", falling(values), text_of(values)))
-    return found
+    return [*found, _order_of_data(_probe_values(evidence, "probe_rank"))]
+
+
+def _probe_values(evidence: Evidence, metric: str) -> Values | None:
+    """By beta, 0 included; ``None`` unless there is a value for each."""
+    dataset_id, probe = evidence.id_of(None), evidence.experiment.variant("probe")
+    values = scoped(evidence)
+    for beta in (0, *PROBE_BETAS):
+        if dataset_id is None:
+            return None
+        value = evidence.tail_mean(probe_curve(evidence, probe, dataset_id, metric, beta), dataset_id)
+        if value is None:
+            return None
+        values[f"beta {beta}"] = value
+    return values
+
+
+def _order_of_data(values: Values | None) -> Verdict:
+    holds: bool | str | None = None
+    if values is not None:
+        floor, *others = values.values()
+        holds = True if min(others) >= floor else CLOSE if min(others) >= floor - 0.05 else False
+    return judge(
+        "C1: the ranking of actions inside the data is little changed",
+        "for each beta the rank correlation of Q - V of the data's actions with that of beta 0, over a batch, is at least "
+        "that of the two critics of beta 0 (shown as beta 0), which differ in their first weights alone; too close to tell "
+        f"up to 0.05 below ({TENTH})",
+        holds,
+        "" if values is None else values.text(2),
+    )
 
 
 # Standard deviation over seeds of the logarithm of the learned alpha: DCE and SAC with V on halfcheetah-medium-sb3, three
