@@ -62,7 +62,7 @@ def scored(name: str, by_data: dict[str, dict[str, float]], metric: str = "score
         ("fig-beta", "score", {"beta 0": 60, "BC": 40}, "With beta 0 the agent does badly"),
         ("fig-beta", "score", {"beta 0": 10, "SAC without V": 40}, "better than SAC without V"),
         ("fig-sac", "q_data", {"SAC, alpha 1": 100, "SAC with V, alpha 1": 60}, "far lower (paper: 4000 and 400), alpha 1"),
-        ("fig-alpha", "ent_coef", {f"beta {b}": 1 - b / 10 for b in (0, 1, 2, 4, 8)}, "rises with beta"),
+        ("fig-alpha", "ent_coef", {f"beta {b}": 1 - b / 10 for b in (0, 1, 2, 4, 8)}, f"within a range, on {CHEETAH}"),
         (
             "fig-tau",
             "score",
@@ -119,19 +119,28 @@ def test_two_agents_that_fail_are_not_compared(name: str, values: dict[str, floa
     assert one_of(outcomes(name, scored(name, {CHEETAH: values})), claim) == UNTESTED
 
 
-@pytest.mark.parametrize(("alphas", "outcome"), [((0.50, 0.52, 0.54), CLOSE), ((0.5, 0.4, 0.9), NOT_HELD)])
+@pytest.mark.parametrize(
+    ("alphas", "outcome"),
+    [
+        ((0.50, 0.52, 0.54, 0.56, 0.58), CLOSE),
+        ((0.50, 0.54, 0.58, 0.62, 0.66), HELD),  # no step of it is more than seeds can do, the whole is
+        ((0.5, 0.6, 0.4, 0.9, 1.0), NOT_HELD),
+    ],
+)
 def test_alpha_rises_by_more_than_seeds_can_do(alphas: tuple[float, ...], outcome: str) -> None:
-    values = {f"beta {b}": alpha for b, alpha in zip((1, 2, 4), alphas, strict=True)}
-    assert one_of(outcomes("fig-alpha", scored("fig-alpha", {CHEETAH: values}, "ent_coef")), "rises with beta") == outcome
-    both = {CHEETAH: values, "halfcheetah-medium-replay-sb3": {"beta 1": 0.3, "beta 4": 0.1}}
-    assert one_of(outcomes("fig-alpha", scored("fig-alpha", both, "ent_coef")), "rises with beta") == NOT_HELD
+    replay = "halfcheetah-medium-replay-sb3"
+    values = {f"beta {b}": alpha for b, alpha in zip((0, 1, 2, 4, 8), alphas, strict=True)}
+    both = {CHEETAH: values, replay: {"beta 1": 0.3, "beta 4": 0.1}}
+    found = outcomes("fig-alpha", scored("fig-alpha", both, "ent_coef"))
+    assert one_of(found, f"rises with beta, within a range, on {CHEETAH}") == outcome
+    assert one_of(found, f"rises with beta, within a range, on {replay}") == NOT_HELD, "each set is a matter of its own"
 
 
 def test_set_without_all_betas_is_not_tested_but_refutes() -> None:
-    whole = {CHEETAH: {"beta 1": 0.3, "beta 2": 0.5, "beta 4": 0.9}}
     for values, outcome in (((0.3, 0.9), UNTESTED), ((0.5, 0.5), UNTESTED), ((0.9, 0.3), NOT_HELD)):
-        two = {"halfcheetah-medium-replay-sb3": dict(zip(("beta 1", "beta 4"), values, strict=True))}
-        assert one_of(outcomes("fig-alpha", scored("fig-alpha", {**whole, **two}, "ent_coef")), "rises with beta") == outcome
+        two = {CHEETAH: dict(zip(("beta 1", "beta 4"), values, strict=True))}
+        found = outcomes("fig-alpha", scored("fig-alpha", two, "ent_coef"))
+        assert one_of(found, f"within a range, on {CHEETAH}") == outcome
 
 
 def test_seeds_that_agree_tell_a_smaller_difference() -> None:
@@ -159,7 +168,7 @@ def test_seeds_that_agree_tell_a_smaller_difference() -> None:
         ("fig-beta", "score", {"beta 0": 10, "BC": 40}, "With beta 0 the agent does badly"),
         ("fig-beta", "score", {"beta 0": 60, "SAC without V": 40}, "better than SAC without V"),
         ("fig-sac", "q_data", {"SAC, alpha 1": 100, "SAC with V, alpha 1": 40}, "far lower (paper: 4000 and 400), alpha 1"),
-        ("fig-alpha", "ent_coef", {f"beta {b}": b / 10 for b in (0, 1, 2, 4, 8)}, "rises with beta"),
+        ("fig-alpha", "ent_coef", {f"beta {b}": (b + 1) / 10 for b in (0, 1, 2, 4, 8)}, f"within a range, on {CHEETAH}"),
     ],
 )
 def test_claims_hold_on_numbers_that_bear_them_out(name: str, metric: str, values: dict[str, float], claim: str) -> None:
@@ -197,7 +206,8 @@ def test_bound_and_shift_are_judged_by_the_worst_beta(factors: tuple[float, ...]
         curves = {"q_data": [400.0 - x for x in lowered], "value": [399.0 - (x - factor * unit) / 0.99 for x in lowered]}
         parts.append(run_rows(experiment, variant.name, CHEETAH, 0, curves=curves, n_updates=100_000))
     found = outcomes("bounds", results.merge(parts))
-    assert one_of(found, "at most the bound") == outcome and one_of(found, "Q on the data is lowered") == outcome
+    assert one_of(found, "Q on the data is lowered") == outcome
+    assert one_of(found, "at most the bound") == UNTESTED, "its density ratio is not known"
 
 
 @pytest.mark.parametrize(
@@ -227,8 +237,10 @@ def test_best_on_every_set_is_not_best_on_one() -> None:
     table = load_experiment("table1")
     agents = {v.name: [40.0, 42.0] for v in table.variants}
     names = [f"halfcheetah-{kind}-sb3" for kind in ("random", "medium", "medium-replay", "medium-expert")]
-    rows = table_rows(table, {n: {**agents, "DCE": [90.0, 92.0] if n == names[0] else [10.0, 12.0]} for n in names})
-    assert one_of(outcomes("table1", rows), "C4") == NOT_HELD
+    scores = {n: {**agents, "DCE": [90.0, 92.0] if n == names[0] else [10.0, 12.0]} for n in names}
+    for n_updates, outcome in ((100_000, NOT_HELD), (50_000, UNTESTED)):  # beta changes for the first time after 50,000
+        rows = table_rows(table, scores, n_updates=n_updates)
+        assert one_of(outcomes("table1", rows), "C4") == outcome
 
 
 def test_claim_on_seeds() -> None:
@@ -275,8 +287,8 @@ def test_an_agent_that_diverges_has_failed() -> None:
     assert one_of(found, "Eq. 18 is better on halfcheetah") == HELD, "its other seeds do not make up for the one it lost"
     table, names = load_experiment("table1"), [f"halfcheetah-{k}-sb3" for k in ("random", "medium", "medium-replay")]
     agents = {v.name: [40.0] for v in table.variants}
-    parts = [table_rows(table, {name: {**agents, "DCE": [90.0]} for name in names})]
-    parts += [lost("table1", "DCE", "halfcheetah-medium-expert-sb3"), lost("table1", "BC", "halfcheetah-medium-expert-sb3")]
+    parts = [table_rows(table, {name: {**agents, "DCE": [90.0]} for name in names}, n_updates=100_000)]
+    parts += [lost("table1", v, "halfcheetah-medium-expert-sb3").assign(n_updates=100_000) for v in ("DCE", "BC")]
     assert one_of(outcomes("table1", results.merge(parts)), "C4") == NOT_HELD
 
 
@@ -291,6 +303,14 @@ def test_q_of_sac_that_diverged_is_compared_with_runs_that_are_there() -> None:
     assert one_of(outcomes("fig-sac", sac), "far lower (paper: 4000 and 400), alpha 1") == UNTESTED
     with_v = scored("fig-sac", {CHEETAH: {"SAC with V, alpha 1": 60}}, "q_data", n_updates=1000)
     assert one_of(outcomes("fig-sac", results.merge([sac, with_v])), "far lower (paper: 4000 and 400), alpha 1") == HELD
+
+
+def test_q_that_still_rises_has_no_level_to_compare() -> None:
+    experiment = load_experiment("fig-sac")
+    for slope, outcome in ((3.0, UNTESTED), (0.1, NOT_HELD)):
+        curves = {"SAC, alpha auto": [400.0 + slope * i for i in range(20)], "SAC with V, alpha auto": [390.0] * 20}
+        runs = [run_rows(experiment, n, CHEETAH, 0, curves={"q_data": q}, n_updates=200_000) for n, q in curves.items()]
+        assert one_of(outcomes("fig-sac", results.merge(runs)), "(paper: 4000 and 400), alpha auto") == outcome
 
 
 @pytest.mark.parametrize(("n_updates", "outcome"), [(99_000, UNTESTED), (100_000, NOT_HELD)])
@@ -399,14 +419,23 @@ def test_single_runs_spread_on_each_data_set_as_the_papers_dce() -> None:
     table = load_experiment("table1")
     hopper = {"hopper-medium-sb3": {"DCE": [40.0], "BC": [60.0]}, CHEETAH: {"DCE": [40.0], "BC": [60.0]}}
     evidence = Evidence(table, table_rows(table, hopper), table.scales["cpu"])
-    assert [uncertainty(evidence, evidence.last(table.variant("DCE"), name), name).error for name in hopper] == [12.3, 4.2]
+    assert [uncertainty(evidence, table.variant("DCE"), name).error for name in hopper] == [12.3, 4.2]
+
+
+def test_a_curve_that_jumps_tells_little() -> None:
+    experiment = load_experiment("fig-cql-return")
+    for jump, outcome in ((0.0, HELD), (20.0, CLOSE)):
+        curves = {"DCE": [40.0 - jump, 40.0 + jump, 40.0], "Eq. 18": [70.0] * 3}
+        runs = [run_rows(experiment, name, CHEETAH, 0, curves={"score": curve}) for name, curve in curves.items()]
+        assert one_of(outcomes("fig-cql-return", results.merge(runs)), "Eq. 18 is better on halfcheetah") == outcome
 
 
 def test_first_by_a_hair_is_not_best() -> None:
     table = load_experiment("table1")
     names = [f"halfcheetah-{kind}-sb3" for kind in ("random", "medium", "medium-replay", "medium-expert")]
     for dce, outcome in ((40.1, CLOSE), (60.0, CLOSE), (95.0, HELD), (-15.0, NOT_HELD)):
-        rows = table_rows(table, {name: {**{v.name: [40.0] for v in table.variants}, "DCE": [dce]} for name in names})
+        scores = {name: {**{v.name: [40.0] for v in table.variants}, "DCE": [dce]} for name in names}
+        rows = table_rows(table, scores, n_updates=100_000)
         assert one_of(outcomes("table1", rows), "C4") == outcome
 
 
@@ -415,7 +444,7 @@ def test_few_seeds_are_taken_to_spread_as_much_as_any_agent_on_the_data() -> Non
 
     def errors(**scores: list[float]) -> list[float]:
         evidence = Evidence(table, table_rows(table, {CHEETAH: scores}), table.scales["cpu"])
-        return [uncertainty(evidence, evidence.last(table.variant(name), CHEETAH), CHEETAH).error for name in scores]
+        return [uncertainty(evidence, table.variant(name), CHEETAH).error for name in scores]
 
     assert errors(DCE=[10.0, 70.0]) == [pytest.approx(30.0)]
     assert errors(DCE=[40.0, 40.0]) == [pytest.approx(4.2 / np.sqrt(2))]
@@ -457,10 +486,11 @@ def test_alpha_differs_between_data_sets_by_a_factor(alphas: tuple[float, ...], 
     assert one_of(outcomes("fig-alpha", rows), "between data sets (MuJoCo)") == UNTESTED, "two sets of one task"
 
 
-@pytest.mark.parametrize(("slope", "outcome"), [(0.5, HELD), (2.0, NOT_HELD), (0.97, CLOSE)])
-def test_flatter_curve_is_the_one_that_varies_less(slope: float, outcome: str) -> None:
+@pytest.mark.parametrize(("size", "outcome"), [(0.5, HELD), (2.0, NOT_HELD), (0.97, CLOSE)])
+def test_flatter_curve_is_the_one_that_varies_less_about_its_trend(size: float, outcome: str) -> None:
     experiment = load_experiment("fig-cql-q")
-    curves = {"expectile 0.7": [float(i) for i in range(25)], "without policy": [slope * i for i in range(25)]}
+    wave = [float((-1) ** i) for i in range(25)]
+    curves = {"expectile 0.7": wave, "without policy": [size * w + 10.0 * i for i, w in enumerate(wave)]}
     for n_updates, expected in ((200_000, outcome), (100_000, UNTESTED)):  # before, Q is on the way to its level
         rows = [run_rows(experiment, n, CHEETAH, 0, curves={"q_data": q}, n_updates=n_updates) for n, q in curves.items()]
         assert one_of(outcomes("fig-cql-q", results.merge(rows)), "Q is flatter") == expected
@@ -468,8 +498,8 @@ def test_flatter_curve_is_the_one_that_varies_less(slope: float, outcome: str) -
 
 def test_curve_without_any_spread_is_the_flatter_one() -> None:
     experiment = load_experiment("fig-cql-q")
-    for slope, outcome in ((1.0, HELD), (0.0, CLOSE)):
-        curves = {"expectile 0.7": [slope * i for i in range(25)], "without policy": [5.0] * 25}
+    for size, outcome in ((1.0, HELD), (0.0, CLOSE)):
+        curves = {"expectile 0.7": [5.0 + size * (-1) ** i for i in range(25)], "without policy": [5.0] * 25}
         rows = [run_rows(experiment, n, CHEETAH, 0, curves={"q_data": q}, n_updates=200_000) for n, q in curves.items()]
         assert one_of(outcomes("fig-cql-q", results.merge(rows)), "Q is flatter") == outcome
 

@@ -16,8 +16,8 @@ from sb3_dce.experiments.text_table import TextTable
 ADROIT = [f"{task}-{kind}-v0" for kind in ("human", "cloned") for task in ("pen", "hammer", "door", "relocate")]
 KITCHEN = ["kitchen-complete-v0", "kitchen-partial-v0", "kitchen-mixed-v0"]
 V_BOUND = (
-    "derived, and not shown by an experiment of the paper; from expectile 0.5 on R_max / (1 - gamma), which bounds any return, is "
-    "no weaker; below, it does not follow"
+    "derived, and not shown by an experiment of the paper; from expectile 0.5 on R_max / (1 - gamma), which bounds any "
+    "return, is no weaker; below, it does not follow"
 )
 
 
@@ -31,11 +31,16 @@ def claim_table(evidences: Mapping[str, Evidence], judged: Mapping[str, list[Ver
     """
     rows = [
         _labelled(judged.get("fig-ood", []), "C1"),
-        ("C2", "no pre-training is needed", HELD, "by construction: no agent here is trained before DCE"),
+        ("C2", "no pre-training is needed", f"{HELD} (a check)", "by construction: no agent here is trained before DCE"),
         ("C3", *_outcome(_faster_than_cql(evidences.get("run-times")))),
         *(_labelled(judged.get("table1", []), label) for label in ("C4", "C5", "C6")),
         ("C7", *_outcome(_seeds_matter([e for name in TABLES if (e := evidences.get(name)) is not None]))),
-        ("C8", "state of the art", NOT_HELD, _own_total()),
+        (
+            "C8",
+            "state of the art",
+            NOT_HELD,
+            f"{_own_total()}; rule: first in every total of the paper's own tables (M9: by how much)",
+        ),
         _labelled(judged.get("table-adroit-kitchen", []), "C9"),
         ("C10", "V is bounded by 2 tau R_max / (1 - gamma)", UNTESTED, V_BOUND),
         ("C11", "beta could be found automatically", UNTESTED, "named as future work"),
@@ -147,6 +152,10 @@ def _faster_than_cql(evidence: Evidence | None) -> Verdict:
     return judge("DCE is faster than CQL", "least run times, of the authors' settings in float32", holds, numbers)
 
 
+# The paper's examples spread by 12.3 to 37 over five seeds; the lower end of the first one's interval is 7.4.
+WIDE = 5.0
+
+
 def _seeds_matter(evidences: list[Evidence]) -> Verdict:
     spreads: dict[str, np.ndarray] = {}
     scopes: dict[str, str] = {}
@@ -158,10 +167,11 @@ def _seeds_matter(evidences: list[Evidence]) -> Verdict:
                 spreads[name], scopes[name] = most[0], f"{most[1]:,} steps, {len(most[0])} seeds"
     widest = sorted(spreads, key=lambda name: -sample_std(spreads[name]))[:3]
     numbers = Values((f"{name}, {scopes[name]}", sample_std(spreads[name])) for name in widest).text()
-    holds = spreads_beyond(spreads, 10.0, "hopper-medium", "pen-human")
+    holds = spreads_beyond(spreads, WIDE, "hopper-medium", "pen-human")
     rule = (
         f"with {PAPER_SEEDS} seeds or more, on some data the 95 % interval of the standard deviation over seeds (chi-square, "
-        "divided among the data) is above 10; did not hold: on all below"
+        f"divided among the data) is above {WIDE:g}; did not hold: it is below {WIDE:g} on all data, Hopper-medium's or "
+        "Pen-human's among them"
     )
     claim = "seeds matter (paper: 12.3 on hopper-medium, 18.4 on hopper-medium-expert, 37 on pen-human)"
     return judge(claim, rule, holds, numbers)

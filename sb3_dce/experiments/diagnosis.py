@@ -18,6 +18,8 @@ from sb3_dce.experiments.text_table import TextTable
 # A change counts as a cause if it closes this share of the distance to the better of BC and IQL.
 SHARE = 0.5
 RIVALS = ("BC", "IQL")
+# Q on the data that is further from its target than this share of the shift is not near it.
+GAP = 0.2
 
 
 def score_of(evidence: Evidence, variant: Variant, dataset_id: str) -> float | None:
@@ -46,21 +48,28 @@ def variant_table(evidence: Evidence) -> TextTable:
     rows = []
     for _, name in evidence.table_rows():
         scores = [score_of(evidence, v, name) for v in variants]
-        cells = [
-            "diverged" if evidence.n_diverged(v, name) else "-" if score is None else f"{score:.1f}"
-            for v, score in zip(variants, scores, strict=True)
-        ]
+        cells = [_cell(evidence, v, name, score) for v, score in zip(variants, scores, strict=True)]
         rows.append((name, *cells, verdict_of(evidence, name)))
     header = ("data", *(v.name for v in variants), "finding")
     note = (
         "Each column after DCE changes one thing of the paper's row; 'scaled rewards' is one setting for all data, beta 4 "
         f"with returns that spread over 1000. A change is named as a cause if it closes at least {SHARE:.0%} of the distance "
-        f"between DCE and the better of BC and IQL, and is clearly better ({CLEARLY}). One that "
-        "is none over the length of the runs (a constant beta, before the first change of the row's schedule) differs by "
-        "rounding alone and is not counted. Rising and falling are the same share between the middle and the end of the run; "
-        "the survival condition is that the mean reward exceeds beta_eff."
+        f"between DCE and the better of BC and IQL, and is clearly better ({CLEARLY}). '=' is a change that is none: the row "
+        "has it already, or, as a constant beta, over the length of the runs. Numbers of seeds stand where there are several. "
+        "Rising and falling are the same share between the middle and the end of the run; the survival condition is that the "
+        "mean reward exceeds beta_eff."
     )
     return TextTable(header, tuple(rows), f"{_caption(evidence)} {note}")
+
+
+def _cell(evidence: Evidence, variant: Variant, dataset_id: str, score: float | None) -> str:
+    dce = evidence.experiment.variant("DCE")
+    if variant.algo == dce.algo and variant is not dce and _is_same(evidence, variant, dce, dataset_id):
+        return "="
+    if score is None:
+        return "diverged" if evidence.n_diverged(variant, dataset_id) else "-"
+    n = len(evidence.last(variant, dataset_id))
+    return f"{score:.1f}" + (f" ({n} seeds)" if n > 1 else "")
 
 
 def diagnostics_table(evidence: Evidence) -> TextTable:
@@ -117,7 +126,7 @@ def verdict_of(evidence: Evidence, dataset_id: str) -> str:
     best = max(rivals, key=rivals.__getitem__)
 
     def uncertain(of: Variant) -> Uncertainty:
-        return uncertainty(evidence, evidence.last(of, dataset_id), dataset_id)
+        return uncertainty(evidence, of, dataset_id)
 
     own = uncertain(variant)
     gap = rivals[best] - dce
@@ -144,9 +153,13 @@ def verdict_of(evidence: Evidence, dataset_id: str) -> str:
     if middle is not None and end is not None and abs(end - middle) >= SHARE * gap:
         causes.append(f"{'still rising' if end > middle else 'falling'} ({middle:.1f} in the middle of the run)")
     if (longer := evidence.last_of_longer(variant, dataset_id)) is not None:
-        n = len(longer[0])
-        causes.append(f"{longer[0].mean():.1f} after {longer[1]:,} steps ({n} seed{'s' if n > 1 else ''})")
+        n, late = len(longer[0]), evidence.late_mean_of_longer(variant, dataset_id)
+        also = "" if late is None else f"; mean of the last ten evaluations {late:.1f}"
+        causes.append(f"{longer[0].mean():.1f} after {longer[1]:,} steps ({n} seed{'s' if n > 1 else ''}{also})")
     excluded += lost
+    gap_td, unit = (evidence.tail(variant, dataset_id, metric) for metric in ("gap_td", "beta_eff"))
+    if gap_td is not None and unit and abs(gap_td) > GAP * unit:
+        excluded.append(f"gap_td {gap_td:.2f} is more than {GAP:.0%} of beta_eff")
     if not causes or not (changed or lost):
         excluded.insert(0, "none of the changes explains it" if changed or lost else "no change was run")
     behind = f"behind {best} by {gap:.1f}" + (", which seeds can do" if close else "")

@@ -36,6 +36,8 @@ from sb3_dce.theory import beta_eff, shift_factor, value_shift_factor
 
 UPDATES_PER_EPOCH = 1000
 TAIL = 0.1  # share of a run, from its end, that stands for what it has become
+N_JUMPS = 3  # last evaluations of a run, by which it is seen how far its score moves between two
+N_LATE = 10  # last evaluations, whose mean stands beside the last score of a run
 GAMMA, TAU = 0.99, 0.005  # of all DCE runs of the figures (paper, common configuration)
 
 
@@ -351,6 +353,19 @@ class Evidence:
         rows = rows[rows["n_updates"] > (self.n_updates(dataset_id) or 0)]
         return _scores_and_length(rows[rows["n_updates"] == rows["n_updates"].max()])
 
+    def late_mean_of_longer(self, variant: Variant, dataset_id: str) -> float | None:
+        """
+        Mean of the last ten evaluations of the runs of :meth:`last_of_longer`: the last one alone may be a jump.
+
+        :param variant: of the experiment
+        :param dataset_id: data
+        :return: normalised score, over seeds; ``None`` without such runs, or with fewer evaluations
+        """
+        rows = self.rows_of_any_length(variant, dataset_id)
+        rows = rows[rows["n_updates"] > (self.n_updates(dataset_id) or 0)]
+        curve = curve_of(rows[rows["n_updates"] == rows["n_updates"].max()], "score")
+        return mean_over_seeds(curve.tail(N_LATE)) if len(curve) >= N_LATE else None
+
     def last_of_most_seeds(self, variant: Variant, dataset_id: str) -> tuple[np.ndarray, int] | None:
         """
         Scores at whichever length has the most seeds, by which it is judged how far seeds spread.
@@ -378,6 +393,18 @@ class Evidence:
         ends = rows[(rows["metric"] == "score") & (rows["step"] == rows["n_updates"])]
         stds = ends.groupby(["agent", "config_hash", "n_updates"], observed=True)["value"].std(ddof=1).dropna()
         return float(stds.max()) if len(stds) else 0.0
+
+    def jumps(self, variant: Variant, dataset_id: str) -> float:
+        """
+        How far a score moves from one evaluation to the next: a run whose curve jumps could as well have ended elsewhere.
+
+        :param variant: of the experiment
+        :param dataset_id: data
+        :return: standard deviation of the last three evaluations of a run, root of its mean square over the runs that count; 0
+            with fewer evaluations
+        """
+        last = self.curve(variant, dataset_id, "score").tail(N_JUMPS)
+        return float(np.sqrt((last.std(ddof=1) ** 2).mean())) if len(last) == N_JUMPS and last.size else 0.0
 
     # -- numbers ---------------------------------------------------------------------------------------------------
 

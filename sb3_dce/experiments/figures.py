@@ -34,6 +34,7 @@ LABELS = {
     "probe_rank": r"rank correlation of $Q_\beta - V_\beta$ and $Q_0 - V_0$",
 }
 WIDTH, HEIGHT, COLUMNS = 4.6, 4.2, 3
+SMALLEST_RANGE = 10.0  # of an axis of scores
 
 
 def draw(evidence: Evidence, folder: Path, name: str) -> list[Path]:
@@ -132,8 +133,10 @@ def _panel(evidence: Evidence, panel: Panel, axes: Axes) -> None:
     if panel.scale != "linear":
         axes.set_yscale(panel.scale)
     axes.grid(alpha=0.3)
-    if panel.metric == "score" and curves and (dataset_id := evidence.id_of(panel.dataset)) is not None:
-        _add_returns(axes, dataset_id)
+    if panel.metric == "score" and curves:
+        _keep_failures_small(axes)
+        if (dataset_id := evidence.id_of(panel.dataset)) is not None:
+            _add_returns(axes, dataset_id)
     if curves:
         for name in _missing(evidence, panel, curves):
             axes.plot([], [], linestyle="none", label=f"{name}: no curve")
@@ -142,6 +145,14 @@ def _panel(evidence: Evidence, panel: Panel, axes: Axes) -> None:
     else:
         axes.set(xticks=[], yticks=[])
         axes.text(0.5, 0.5, _absence(evidence, panel), ha="center", va="center", transform=axes.transAxes, color="0.4")
+
+
+def _keep_failures_small(axes: Axes) -> None:
+    """Scores of agents that fail, stretched over the whole axis, would look like those of agents that learn."""
+    low, high = axes.get_ylim()
+    if high - low < SMALLEST_RANGE:
+        middle = (low + high) / 2.0
+        axes.set_ylim(middle - SMALLEST_RANGE / 2.0, middle + SMALLEST_RANGE / 2.0)
 
 
 def _add_returns(axes: Axes, dataset_id: str) -> None:

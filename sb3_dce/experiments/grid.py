@@ -93,6 +93,15 @@ class GridDataset:
         """
         return "no data" if self.twin is None else "not run"
 
+    @property
+    def why_untested(self) -> str:
+        """
+        Why a claim about this set has no numbers: as :attr:`absence`, but runs on data of another kind would test it no more.
+
+        :return: "no data", how our data differ in kind, or "not run"
+        """
+        return f"our data are of another kind: {self.note}" if self.other_kind and self.note else self.absence
+
 
 @dataclass(frozen=True)
 class Panel:

@@ -28,8 +28,9 @@ SEED_STD_FREEDOM = 4
 CLEARLY = (
     "outside of the 95 % interval of Welch's test over seeds, where an agent with fewer than three has the largest standard "
     f"deviation of these: {SEED_STD:g} (DCE on HalfCheetah, five seeds), that of the paper's DCE on such data (five seeds), "
-    "those of the experiment's agents with two seeds or more on these data, after any number of steps; deviations are those "
-    "of last scores, also where means over the last tenth of the run are compared, which as a rule spread less"
+    "those of the experiment's agents with two seeds or more on these data, after any number of steps, and that of its own "
+    "last three evaluations, by which a curve that jumps, or still rises, tells little; deviations are those of last scores, "
+    "also where means over the last tenth of the run are compared (of a run of 50,000 steps that is its last evaluation)"
 )
 # Seeds from which on an agent's own deviation is taken.
 FEWEST_OWN = 3
@@ -138,28 +139,29 @@ def values_of(evidence: Evidence, names: list[str], metric: str, dataset: str | 
             return None
         values[variant.name] = value
         if metric == "score":
-            values.errors[variant.name] = uncertainty(evidence, view.last(variant, dataset_id), dataset_id)
+            values.errors[variant.name] = uncertainty(view, variant, dataset_id)
     values.scope = view.scope(dataset_id, variants)
     values.other_kind = view.other_kind(dataset)
     return values
 
 
-def uncertainty(evidence: Evidence, own: np.ndarray, dataset_id: str) -> Uncertainty:
+def uncertainty(evidence: Evidence, variant: Variant, dataset_id: str) -> Uncertainty:
     """
     Standard error of an agent's mean score, from its own seeds if it has three or more, else from the largest known deviation.
 
-    :param evidence: rows of the experiment
-    :param own: last scores of an agent, one per seed
+    :param evidence: rows of the experiment, or the part of it that a claim is about
+    :param variant: agent
     :param dataset_id: data
     :return: of their mean; one or two seeds say little on their spread, what is taken for it is said in ``CLEARLY``
     """
+    own = evidence.last(variant, dataset_id)
     n = max(1, len(own))
     if n >= FEWEST_OWN:
         return Uncertainty(sample_std(own) / math.sqrt(n), n - 1)
     papers = {evidence.paper_id(dataset) for dataset, name in evidence.table_rows() if name == dataset_id}
     cells = [paper_score(paper, "DCE") for paper in papers]
     known = [cell.std for cell in cells if cell is not None and cell.std is not None]
-    largest = max([SEED_STD, evidence.largest_spread(dataset_id), *known])
+    largest = max([SEED_STD, evidence.largest_spread(dataset_id), evidence.jumps(variant, dataset_id), *known])
     return Uncertainty(largest / math.sqrt(n), SEED_STD_FREEDOM, borrowed=True)
 
 

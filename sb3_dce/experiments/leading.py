@@ -5,11 +5,15 @@ from __future__ import annotations
 import math
 
 from sb3_dce.experiments.evidence import Evidence
-from sb3_dce.experiments.grid import GridDataset, Variant, source_of
+from sb3_dce.experiments.grid import GridDataset, Variant, settings_in_force, source_of
 from sb3_dce.experiments.judging import CLOSE, Verdict, all_diverged, differs, judge, uncertainty
 from sb3_dce.experiments.paper import PAPER_SEEDS
+from sb3_dce.schedules import StepSchedule
 
 DIVIDED = "the 5 % of the test are divided among all comparisons of the claim"
+BEGUN = "only runs count in which DCE's schedule of beta, where it has one, has begun"
+# Over these the paper claims no advantage on medium-expert sets.
+EXPERT_RIVALS = ("PBRL", "IQL", "TD3-BC", "CQL")
 
 
 def leading(evidence: Evidence) -> list[Verdict]:
@@ -29,7 +33,7 @@ def leading(evidence: Evidence) -> list[Verdict]:
         ),
         _has_no_advantage(
             "C6: DCE has no significant advantage on medium-expert sets",
-            Field(evidence, [d for d in datasets if d.paper.endswith("-medium-expert-v2")]),
+            Field(evidence, [d for d in datasets if d.paper.endswith("-medium-expert-v2")], EXPERT_RIVALS),
         ),
     ]
 
@@ -41,20 +45,30 @@ class Field:
 
     :param evidence: of a table
     :param wanted: rows of the table that the claim is about
+    :param rivals: agents it names; ``None`` for all of the paper's
     """
 
-    def __init__(self, evidence: Evidence, wanted: list[GridDataset]) -> None:
+    def __init__(self, evidence: Evidence, wanted: list[GridDataset], rivals: tuple[str, ...] | None = None) -> None:
         self.evidence = evidence
         self.dce = evidence.experiment.variant("DCE")
-        self.others = [v for v in evidence.experiment.variants if v.paper is not None and v is not self.dce]
+        papers = [v for v in evidence.experiment.variants if v.paper is not None and v is not self.dce]
+        self.others = [v for v in papers if rivals is None or v.name in rivals]
+        self.n_wanted = len(wanted)
         rows = [name for dataset, name in evidence.table_rows() if dataset in wanted]
         rows = [name for name in rows if len(evidence.last(self.dce, name)) or all_diverged(evidence, self.dce, name)]
         by_source = {source: [name for name in rows if source_of(name) == source] for source in ("D4RL", "sb3")}
         self.ids = max(by_source.values(), key=len)
         self.missing = [v.name for name in self.ids for v in self.agents if not evidence.has_ended(v, name)]
         lengths = {evidence.n_updates(name) for name in self.ids}
-        self.is_complete = 0 < len(wanted) == len(self.ids) and not self.missing and len(lengths) == 1
+        self.too_short = [name for name in self.ids if not self._has_begun(name)]
+        self.is_complete = 0 < len(wanted) == len(self.ids) and not self.missing and not self.too_short and len(lengths) == 1
         self.n_tests = max(1, sum(len(evidence.rows_of(v, name)) > 0 for v in self.others for name in self.ids))
+
+    def _has_begun(self, dataset_id: str) -> bool:
+        """Whether DCE's runs are long enough for beta to have changed where its row changes it at all."""
+        schedule = StepSchedule.of(settings_in_force(self.dce, dataset_id, self.evidence.scale))
+        is_constant = schedule.value(schedule.every) == schedule.initial
+        return is_constant or (self.evidence.n_updates(dataset_id) or 0) > schedule.every
 
     @property
     def agents(self) -> list[Variant]:
@@ -84,15 +98,20 @@ class Field:
         """
         return all(self._is_above(self.dce, v, dataset_id) for v in self.others)
 
-    def is_beaten(self, dataset_id: str) -> bool:
+    def ahead(self, dataset_id: str) -> list[str]:
         """
-        Whether an agent is above DCE by more than seeds could do, or DCE has failed, having diverged on a seed.
+        Agents that are above DCE by more than seeds could do, whether the others have runs or not.
 
         :param dataset_id: data
-        :return: true as soon as one agent is, whether the others have runs or not
+        :return: names; "nobody, but DCE diverged" if it has failed, having diverged on a seed, and no agent is above it
         """
-        failed = self.evidence.n_diverged(self.dce, dataset_id) > 0
-        return failed or any(self._is_above(v, self.dce, dataset_id) for v in self.others)
+        names = [v.name for v in self.others if self._is_above(v, self.dce, dataset_id)]
+        return names or (["nobody, but DCE diverged"] if self.evidence.n_diverged(self.dce, dataset_id) else [])
+
+    @property
+    def beaten(self) -> dict[str, list[str]]:
+        """By data on which DCE's schedule has begun the agents ahead of it; data without any are left out."""
+        return {name: found for name in self.ids if name not in self.too_short and (found := self.ahead(name))}
 
     def _is_above(self, one: Variant, other: Variant, dataset_id: str) -> bool:
         lost = [self.evidence.n_diverged(v, dataset_id) > 0 for v in (one, other)]
@@ -101,7 +120,7 @@ class Field:
         scores = [self.evidence.last(v, dataset_id) for v in (one, other)]
         if not all(map(len, scores)):
             return False
-        errors = [uncertainty(self.evidence, each, dataset_id) for each in scores]
+        errors = [uncertainty(self.evidence, v, dataset_id) for v in (one, other)]
         return differs(float(scores[0].mean() - scores[1].mean()), errors[0], errors[1], self.n_tests) is True
 
     def numbers(self) -> str:
@@ -115,8 +134,13 @@ class Field:
         by_scope: dict[str, list[str]] = {}
         for name in self.ids:
             scope = self.evidence.scope(name, self.agents).removeprefix(f"{name}, ")
-            by_scope.setdefault(scope, []).append(f"{name}: {self.place(name)}")
+            n_agents = sum(self.evidence.has_ended(v, name) for v in self.agents)
+            by_scope.setdefault(scope, []).append(f"{name}: {self.place(name)} of {n_agents}")
         text = "place of DCE: " + "; ".join(f"{', '.join(places)} ({scope})" for scope, places in by_scope.items())
+        clearly = {name: found for name in self.ids if (found := self.ahead(name))}
+        text += "".join(f"; clearly ahead of it on {name}: {', '.join(found)}" for name, found in clearly.items())
+        if self.too_short:
+            text += f"; before the first change of beta: {len(self.too_short)} of {len(self.ids)} sets"
         absent = [f"{name} on {self.missing.count(name)} of {len(self.ids)} sets" for name in sorted(set(self.missing))]
         return text + (f"; without runs of this length: {', '.join(absent)}" if absent else "")
 
@@ -124,10 +148,10 @@ class Field:
 def _is_best(claim: str, field: Field) -> Verdict:
     rule = (
         "held: DCE is clearly above all the paper's agents on every such set, at one length; did not hold: on one of the sets "
-        f"an agent is clearly above it, or it diverged; {DIVIDED}"
+        f"an agent is clearly above it, or it diverged; {BEGUN}; {DIVIDED}"
     )
     holds: bool | str | None = None
-    if any(map(field.is_beaten, field.ids)):  # missing agents and data can only add to those that are ahead
+    if field.beaten:  # missing agents and data can only add to those that are ahead
         holds = False
     elif field.is_complete:
         holds = True if all(map(field.is_first, field.ids)) else CLOSE
@@ -136,12 +160,15 @@ def _is_best(claim: str, field: Field) -> Verdict:
 
 def _has_no_advantage(claim: str, field: Field) -> Verdict:
     rule = (
-        f"nowhere DCE is clearly above every other agent; held with {PAPER_SEEDS} seeds or more, since fewer show no "
-        f"advantage, whether there is one or not; {DIVIDED}"
+        f"nowhere DCE is clearly above all of {', '.join(EXPERT_RIVALS)}; held if on every such set one of them is clearly "
+        f"above it, or with {PAPER_SEEDS} seeds or more, since fewer show no advantage, whether there is one or not; {BEGUN}; "
+        f"{DIVIDED}"
     )
     holds: bool | None = None
     if field.is_complete and any(map(field.is_first, field.ids)):
         holds = False
+    elif field.n_wanted == len(field.beaten):
+        holds = True
     elif field.is_complete:
         seeds = [len(field.evidence.last(v, name)) for v in field.agents for name in field.ids]
         holds = True if min(seeds) >= PAPER_SEEDS else None

@@ -6,11 +6,14 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
+import pandas as pd
+
 from sb3_dce.errors import ConfigError
 from sb3_dce.experiments.claims import claim_table, own_table_facts
-from sb3_dce.experiments.evidence import Evidence
+from sb3_dce.experiments.evidence import Evidence, runs_in
 from sb3_dce.experiments.judging import CLEARLY, Verdict
 from sb3_dce.experiments.reports import Report, count
+from sb3_dce.experiments.results import RUN_KEY
 from sb3_dce.experiments.tables import parts_of
 from sb3_dce.experiments.text_table import TextTable
 from sb3_dce.files import check_writable, write_text
@@ -76,8 +79,8 @@ def write_page(
         "on them cannot be compared with published ones, which stand beside them in columns of their own, under the D4RL id "
         "they belong to. Scores are those of the last policy, with D4RL's constants, in the version 4 environments.",
         "The paper trains for 1,000,000 steps (500,000 in figures) with five seeds. How long and how often we did stands with "
-        "each number. Its schedules change beta for the first time after 50,000 steps: shorter runs have the first beta "
-        "throughout.",
+        f"each number; {usual_runs(evidences)}. The paper's schedules change beta for the first time after 50,000 steps: up "
+        "to that length runs have the first beta throughout.",
         *coverage(evidences),
         '"Not run": there are no runs yet. "No data": nor can there be any without files of D4RL, which have no stand-in '
         '(Kitchen). "No curve": this line of a figure has no runs of the length of the others.',
@@ -91,6 +94,28 @@ def write_page(
     for name, report in reports.items():
         parts += _section(name, evidences[name], report, scale, link)
     write_text(path, "\n\n".join(part.strip("\n") for part in parts) + "\n")
+
+
+def usual_runs(evidences: Mapping[str, Evidence]) -> str:
+    """
+    How large the page's evidence is, in a clause: the commonest length of its runs, and how many have one seed.
+
+    :param evidences: by experiment
+    :return: such as "most runs have 50,000 steps (150 of 210)"; that there are none, without any
+    """
+    runs = [runs_in(e.every_run(name, e.experiment.variants)) for e in evidences.values() for _, name in e.table_rows()]
+    found = pd.concat(runs).drop_duplicates() if runs else pd.DataFrame()
+    if not len(found):
+        return "there are no runs yet"
+    lengths, cells = (
+        found["n_updates"].value_counts(),
+        found.groupby([c for c in RUN_KEY if c != "seed"], observed=True).size(),
+    )
+    usual = max(lengths.index, key=lambda n: (lengths[n], n))
+    return (
+        f"most have {usual:,} steps ({lengths[usual]} of {len(found)} runs) and one seed ({(cells == 1).sum()} of "
+        f"{len(cells)} agents on a set)"
+    )
 
 
 def coverage(evidences: Mapping[str, Evidence]) -> list[str]:

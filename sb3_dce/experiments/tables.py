@@ -7,7 +7,7 @@ import pandas as pd
 
 from sb3_dce.data.catalog import resolve
 from sb3_dce.experiments.captions import caption
-from sb3_dce.experiments.evidence import Evidence, at_end, curve_of, n_diverged_in, of_seeds_that_ended
+from sb3_dce.experiments.evidence import N_LATE, Evidence, at_end, curve_of, n_diverged_in, of_seeds_that_ended
 from sb3_dce.experiments.grid import Variant, source_of
 from sb3_dce.experiments.paper import MIXED_PROTOCOLS, paper_score, paper_total
 from sb3_dce.experiments.statistics import (
@@ -319,7 +319,7 @@ def long_table(evidence: Evidence) -> TextTable:
                 few = at_end(runs, "score_paper_episodes")
                 curve = of_seeds_that_ended(curve_of(runs, "score"), int(runs["n_updates"].iloc[0]))
                 paper_mode = float(few.mean()) if len(few) else float("nan")
-                last_ten = float(curve.tail(10).mean().mean()) if len(curve) >= 10 else float("nan")
+                last_ten = float(curve.tail(N_LATE).mean().mean()) if len(curve) >= N_LATE else float("nan")
                 late = (last_ten, float(curve.max().mean()))
                 values = (float(scores.mean()), sample_std(scores), low, high, paper_mode, *late)
                 numbers = ["" if np.isnan(v) else f"{v:.4f}" for v in values] + [" ".join(f"{s:.4f}" for s in scores)]

@@ -16,7 +16,8 @@ from sb3_dce.configuration import row_of
 from sb3_dce.dce_probe import PROBE_BETAS
 from sb3_dce.execution import UPDATES_WORTH_COMPILING
 from sb3_dce.experiments.curves import probe_curve, view_of
-from sb3_dce.experiments.evidence import GAMMA, TAU, Evidence, of_seeds_that_ended
+from sb3_dce.experiments.diagnosis import GAP
+from sb3_dce.experiments.evidence import GAMMA, TAU, Evidence, mean_over_seeds, of_seeds_that_ended
 from sb3_dce.experiments.grid import source_of
 from sb3_dce.experiments.judging import (
     CLOSE,
@@ -149,8 +150,8 @@ def _beta(evidence: Evidence) -> list[Verdict]:
         ),
         judge(
             "Q on the data equals r + gamma V - beta_eff (gap_td near zero)",
-            f"abs(gap_td) < 0.2 beta_eff for beta 2, 4, 8 ({TENTH})",
-            None if gaps is None else all(abs(gaps[name]) < 0.2 * units[name] for name in gaps),
+            f"abs(gap_td) < {GAP:g} beta_eff for beta 2, 4, 8 ({TENTH})",
+            None if gaps is None else all(abs(gaps[name]) < GAP * units[name] for name in gaps),
             "" if gaps is None else gaps.text(3),
         ),
     ]
@@ -181,6 +182,10 @@ def _shift(evidence: Evidence) -> list[Verdict]:
 
 
 def _bounds(evidence: Evidence) -> list[Verdict]:
+    """
+    The bound of Eq. 14 has a density ratio that is not known. With 1 it is the shift that theory expects, by which the
+    formulas for Q and V are judged.
+    """
     dataset_id, experiment = evidence.id_of(None), evidence.experiment
     shares = scoped(evidence)
     for name in ("beta 2", "beta 4", "beta 8"):
@@ -191,15 +196,11 @@ def _bounds(evidence: Evidence) -> list[Verdict]:
         settled = theory > 0.5 * penalty_bound(evidence.beta_eff(variant, dataset_id), GAMMA)
         if not lowered.empty and settled.any():
             shares[name] = float((lowered.mean(axis=1) / theory)[settled].max())
-    holds: bool | str | None = None
-    if len(shares) == 3:
-        largest = max(shares.values())
-        holds = CLOSE if 1.001 < largest <= 1.05 else largest <= 1.05
     bound = judge(
         "The penalty lowers Q by at most the bound of Eq. 14",
-        "largest ratio of the measured shift to the bound for as many steps (density ratio 1), from half of its final value "
-        "on, is at most 1; too close to tell up to 1.05, since the critics with and without beta learn from other policies",
-        holds,
+        "not judged: the bound has a density ratio of policy and data that is not known; with 1 it is the shift that theory "
+        "expects. Shown is the largest ratio of the measured shift to that, from half of its final value on",
+        None,
         shares.text(2),
     )
     return [bound, *_shift(evidence)]
@@ -255,27 +256,7 @@ ALPHA_STEP = student_quantile(4) * math.sqrt(2.0) * 0.043
 
 def _alpha(evidence: Evidence) -> list[Verdict]:
     experiment = evidence.experiment
-    rising_betas = evidence.among([f"beta {b}" for b in (1, 2, 4)])
-    variants = rising_betas.experiment.variants
-    rises: list[bool | str | None] = []
-    texts = []
-    for dataset, name in rising_betas.table_rows():
-        values = Values()
-        for v in rising_betas.variants(dataset):
-            if (value := rising_betas.tail(v, name, "ent_coef")) is not None:
-                values[v.name] = value
-        if len(values) > 1 and not dataset.is_other_kind(name):
-            logs = np.diff(np.log(list(values.values())))
-            risen = None if len(values) < len(variants) else bool((logs > ALPHA_STEP).all()) or CLOSE
-            rises.append(False if (logs < -ALPHA_STEP).any() else risen)
-            values.scope = rising_betas.scope(name, variants)
-            texts.append(values.text(4))
-    rule = (
-        f"on every set with runs alpha of beta 1 < 2 < 4, each step by more than {math.exp(ALPHA_STEP) - 1:.0%}, which seeds "
-        f"can do ({TENTH})"
-    )
-    claim = "The learned alpha rises with beta, within a range"
-    found = [judge(claim, rule, all_of(rises) if rises else None, ", ".join(texts))]
+    found = [_alpha_by_beta(evidence, panel.dataset) for panel in experiment.panels if not panel.over]
     beta4 = experiment.variant("beta 4")
     for panel in experiment.panels:
         if panel.over:
@@ -298,6 +279,29 @@ def _alpha(evidence: Evidence) -> list[Verdict]:
             rule = f"largest / smallest above 2 ({TENTH})"
             found.append(on_this_kind(claim, rule, spread, alphas or None, 4, absence=absence))
     return found
+
+
+def _alpha_by_beta(evidence: Evidence, paper: str | None) -> Verdict:
+    """Whether alpha rises with beta on one set: what it does on others is a matter of its own."""
+    dataset = evidence.entry(paper)
+    names = [v.name for v in evidence.variants(dataset)]
+    view = evidence.among(names)
+    values, dataset_id = Values(), view.id_of(paper)
+    for v in view.experiment.variants if dataset_id is not None else ():
+        if (value := view.tail(v, str(dataset_id), "ent_coef")) is not None:
+            values[v.name] = value
+    risen: bool | str | None = None
+    if dataset_id is not None and len(values) > 1:
+        values.scope = view.scope(dataset_id, view.experiment.variants)
+        logs = np.log(list(values.values()))
+        if (np.diff(logs) < -ALPHA_STEP).any():
+            risen = False
+        elif len(values) == len(names):
+            risen = bool(logs[-1] - logs[0] > ALPHA_STEP) or CLOSE
+    seeds_can = f"{math.exp(ALPHA_STEP) - 1:.0%}, which seeds can do"
+    rule = f"alpha of the largest beta is above that of beta 0 by more than {seeds_can}; no step falls by more ({TENTH})"
+    claim = f"The learned alpha rises with beta, within a range, on {dataset_id or dataset.paper}"
+    return judge(claim, rule, risen, values.text(4))
 
 
 # 95 % quantile of the range of five draws of a normal distribution, in standard deviations that are estimates themselves
@@ -327,7 +331,7 @@ def _tau(evidence: Evidence) -> list[Verdict]:
             + ("" if little else f"; some score above {WORKING:g}")
         )
         claim = f"The expectile {word} on {dataset}'s kind of data"
-        found.append(on_this_kind(claim, rule, holds, values, absence=evidence.entry(dataset).absence))
+        found.append(on_this_kind(claim, rule, holds, values, absence=evidence.entry(dataset).why_untested))
     return found
 
 
@@ -341,10 +345,13 @@ def _cql_q(evidence: Evidence) -> list[Verdict]:
     levels = values_of(evidence, ["expectile 0.5", "expectile 0.7", "expectile 0.9"], "q_data")
     rule = f"in-data Q of expectile 0.5 < 0.7 < 0.9 ({TENTH})"
     found = [judge("A higher expectile gives a higher Q (a slacker estimate)", rule, rising(levels), text_of(levels))]
-    slopes = _second_halves(evidence, ["expectile 0.7", "without policy"], lambda curve: float(np.std(curve, ddof=1)))
-    holds = _varies_more(slopes["expectile 0.7"], slopes["without policy"]) if len(slopes) == 2 else None
-    rule = f"standard deviation of the curve over its second half is smaller, by more than a factor of {FLATTER:g}"
-    return [*found, judge("Without a policy in the penalty Q is flatter", rule, holds, _shape_text(slopes, 2))]
+    waves = _second_halves(evidence, ["expectile 0.7", "without policy"], _waviness)
+    holds = _varies_more(waves["expectile 0.7"], waves["without policy"]) if len(waves) == 2 else None
+    rule = (
+        "standard deviation about a straight line through the second half of the curve, which is not moved by a steady "
+        f"approach to its level, is smaller, by more than a factor of {FLATTER:g}"
+    )
+    return [*found, judge("Without a policy in the penalty Q is flatter", rule, holds, _shape_text(waves, 2))]
 
 
 def _cql_return(evidence: Evidence) -> list[Verdict]:
@@ -354,7 +361,7 @@ def _cql_return(evidence: Evidence) -> list[Verdict]:
         other = "DCE" if better == "Eq. 18" else "Eq. 18"
         claim = f"{better} is better on {dataset}'s kind of data"
         rule = f"clearly higher score, one of them above {WORKING:g} ({TENTH})"
-        absence = evidence.entry(dataset).absence
+        absence = evidence.entry(dataset).why_untested
         found.append(on_this_kind(claim, rule, _above_working(values, better, other), values, absence=absence))
     return found
 
@@ -371,6 +378,19 @@ def _lost(evidence: Evidence, name: str) -> bool:
     return all_diverged(evidence, evidence.experiment.variant(name), evidence.id_of(None))
 
 
+# Q of SAC without V may rise for as long as it is trained: it has a level when it rises by less than this.
+LEVEL = 0.02
+
+
+def _late_rise(evidence: Evidence, name: str, dataset_id: str) -> float | None:
+    """By what share in-data Q of a variant has risen in the last quarter of its runs; ``None`` without points."""
+    curve = evidence.curve(evidence.experiment.variant(name), dataset_id, "q_data")
+    n_updates = evidence.n_updates(dataset_id) or 0
+    before = curve[(curve.index > 0.65 * n_updates) & (curve.index <= 0.75 * n_updates)]
+    first, last = mean_over_seeds(before), evidence.tail_mean(curve, dataset_id)
+    return None if first is None or last is None or first == 0 else (last - first) / abs(first)
+
+
 def _sac(evidence: Evidence) -> list[Verdict]:
     found = []
     for alpha in ("alpha 1", "alpha auto"):
@@ -380,15 +400,21 @@ def _sac(evidence: Evidence) -> list[Verdict]:
         q_values = values_of(evidence, names, "q_data")
         lower, text = None, text_of(q_values)
         if q_values is not None and q_values[names[0]] > 0:
-            if data is not None and (view.n_updates(data) or 0) >= SETTLED:
-                lower = q_values[names[1]] < 0.5 * q_values[names[0]]
-            else:
+            rise = None if data is None else _late_rise(view, names[0], data)
+            if data is None or (view.n_updates(data) or 0) < SETTLED:
                 text += f"; needs runs of {SETTLED:,} steps: before, Q is on the way to its level"
+            elif rise is not None and rise > LEVEL:
+                text += f"; Q of {names[0]} still rises, by {rise:.0%} over the last quarter"
+            else:
+                lower = q_values[names[1]] < 0.5 * q_values[names[0]]
         elif _lost(view, names[0]) and view.curve(view.experiment.variant(names[1]), data or "", "q_data").size:
             lower = not _lost(view, names[1])
             scope = view.scope(data or "", view.experiment.variants)
             text = f"{names[0]} diverged, {names[1]} {'did not' if lower else 'did, too'} ({scope})"
-        rule = f"Q of SAC with V below half of that of SAC, or SAC diverges and this does not ({TENTH})"
+        rule = (
+            f"Q of SAC with V below half of that of SAC ({TENTH}), which over the last quarter of its run rises by no more "
+            f"than {LEVEL:.0%}, or SAC diverges and this does not"
+        )
         claim = f"V alone makes Q far lower (paper: 4000 and 400), {alpha}"
         found.append(judge(claim, rule, lower, text))
     # the returns with alpha 1 are judged in the ablation of beta
@@ -466,14 +492,19 @@ def _run_times(evidence: Evidence) -> list[Verdict]:
     numbers = ", ".join(f"{name} {time.text}" for name, time in times.items())
     ordered = bool(np.all(np.diff(seconds) > 0)) if len(times) == len(RUN_TIME_ORDER) else None
     far = times["UWAC"].seconds > FAR_SLOWER * times["CQL"].seconds if {"UWAC", "CQL"} <= times.keys() else None
-    rule = (
-        "least seconds per 1000 updates, evaluations included, of runs that others may have disturbed (on a CPU runs of up to "
-        f"{UPDATES_WORTH_COMPILING:,} updates are not compiled; benchmarks/results/speed.md has both); the authors' settings "
-        "in float32, after the first phases of CQL and UWAC"
+    times_are = (
+        "the least of runs that others may have disturbed, seconds per 1000 updates, evaluations included (on a CPU runs of "
+        f"up to {UPDATES_WORTH_COMPILING:,} updates are not compiled; benchmarks/results/speed.md has both); the authors' "
+        "settings in float32, after the first phases of CQL and UWAC"
     )
     return [
-        judge("Run times are in the order BC < IQL < DCE < CQL < UWAC", rule, ordered, numbers),
-        judge("UWAC is far slower than CQL (paper: 176 and 18 s)", f"{FAR_SLOWER:g} times its {rule}", far, numbers),
+        judge("Run times are in the order BC < IQL < DCE < CQL < UWAC", f"times in this order: {times_are}", ordered, numbers),
+        judge(
+            "UWAC is far slower than CQL (paper: 176 and 18 s)",
+            f"UWAC takes more than {FAR_SLOWER:g} times as long: {times_are}",
+            far,
+            numbers,
+        ),
     ]
 
 
@@ -501,7 +532,7 @@ def _adroit(evidence: Evidence) -> list[Verdict]:
         if min(n_runs) >= FEWEST_SEEDS and any(lost):  # what diverges on a seed has failed
             ups += [lost[1]] if lost[0] != lost[1] else []
         elif min(map(len, scores)) >= FEWEST_SEEDS:
-            spread = [uncertainty(evidence, each, name) for each in scores]
+            spread = [uncertainty(view, v, name) for v in (with_, without)]
             ups.append(differs(float(scores[0].mean() - scores[1].mean()), spread[0], spread[1], len(pairs)))
     numbers = ", ".join(
         f"{name}: {_mean_of(a)} with, {_mean_of(b)} without ({view.scope(name, [with_, without])})"
@@ -528,7 +559,7 @@ def _adroit(evidence: Evidence) -> list[Verdict]:
     rule = (
         f"of the sets with a constant alpha and {PAPER_SEEDS} seeds or more, on some the 95 % interval of the standard "
         "deviation over seeds (chi-square, divided among the sets) is above 15 (paper: 37 on pen-human); did not hold: "
-        "on all below"
+        "it is below 15 on all, Pen-human's among them"
     )
     return [*found, judge("C9: a constant alpha gives high variance over seeds", rule, large, text_of(spreads))]
 
