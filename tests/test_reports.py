@@ -24,7 +24,7 @@ from sb3_dce.experiments.judging import CLOSE, HELD, NOT_HELD, UNTESTED, Verdict
 from sb3_dce.experiments.pages import coverage
 from sb3_dce.experiments.reports import config_table, make_report, toy_table
 from sb3_dce.experiments.run_times import runtime_table
-from sb3_dce.experiments.tables import aggregate_tables, common_rows, long_table, score_table
+from sb3_dce.experiments.tables import aggregate_tables, common_rows, long_table, score_table, seed_table
 from sb3_dce.experiments.text_table import TextTable
 from sb3_dce.experiments.verdicts import verdicts
 from sb3_dce.theory import shift_factor
@@ -225,6 +225,17 @@ def test_all_columns_of_the_long_table_are_over_the_same_seeds() -> None:
     (row,) = [dict(zip(table.header, cells, strict=True)) for cells in table.rows if cells[2] == "DCE"]
     assert (row["n_seeds"], row["n_diverged"], row["scores"]) == ("2", "1", "110.0000 111.0000")
     assert (row["mean"], row["mean_best_evaluation"], row["mean_last_10_evaluations"]) == ("110.5000", "110.5000", "65.5000")
+
+
+def test_scores_stand_seed_by_seed_where_there_are_several() -> None:
+    rows = table_rows(TABLE, {CHEETAH: {"DCE": [15.0, 0.0, 3.0], "BC": [40.0]}})
+    longer = table_rows(TABLE, {CHEETAH: {"DCE": [50.0]}}, n_updates=2000)
+    table = seed_table(evidence_of(results.merge([rows, longer, diverged("DCE", CHEETAH, 1, n_updates=2000)])))
+    assert table is not None and table.rows == (
+        (CHEETAH, "DCE", "1,000", "15.0, 0.0, 3.0", "7.9"),
+        (CHEETAH, "DCE", "2,000", "50.0, diverged", "-"),
+    )
+    assert seed_table(evidence_of(table_rows(TABLE, {CHEETAH: {"BC": [40.0]}}))) is None
 
 
 def test_totals_have_the_papers_sum_of_deviations_beside_the_honest_one() -> None:

@@ -26,6 +26,7 @@ HEADINGS = {
         for ending, where in (("", ""), ("-adroit", ": Adroit"), ("-kitchen", ": Kitchen"))
     },
     "equal-steps": "After equally many steps",
+    "seeds": "Seed by seed",
     "run-times": "Run times",
     "bounds": "Bounds (Eq. 14 to 17)",
     "claim-4.3": "Claim 4.3 on a linear critic",

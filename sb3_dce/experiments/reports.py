@@ -70,6 +70,8 @@ def make_report(evidence: Evidence) -> Report:
         found["scores"] = tables.score_table(evidence)
         if (equal := equal_steps_table(evidence)) is not None:
             found["equal-steps"] = equal
+        if (seeds := tables.seed_table(evidence)) is not None:
+            found["seeds"] = seeds
         found |= {f"aggregates-{part}": table for part, table in tables.aggregate_tables(evidence).items()}
         found["run-times"] = runtime_table(evidence)
         found["long"] = tables.long_table(evidence)

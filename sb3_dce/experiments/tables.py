@@ -294,6 +294,28 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
     return TextTable(header, tuple(rows), f"{caption(evidence, ids, variants)} {note}")
 
 
+def seed_table(evidence: Evidence) -> TextTable | None:
+    """
+    Scores seed by seed, which the mean and deviation of a cell hide: one good seed among failures, or all alike.
+
+    :param evidence: of an experiment with a table
+    :return: one row per agent, data and length with two seeds or more; ``None`` without any
+    """
+    rows = []
+    for dataset, name in evidence.table_rows():
+        # the columns of one agent, as "one setting" where it is the row's, are one
+        agents = {evidence.key_of(variant, name): variant for variant in reversed(evidence.variants(dataset))}
+        for variant in reversed(agents.values()):
+            for length, runs in evidence.rows_of_any_length(variant, name).groupby("n_updates"):
+                scores, lost = at_end(runs, "score"), n_diverged_in(runs)
+                if len(scores) + lost > 1:
+                    each = [*(f"{score:.1f}" for score in scores), *["diverged"] * lost]
+                    spread = f"{sample_std(scores):.1f}" if len(scores) > 1 else "-"
+                    rows.append((name, variant.name, f"{length:,}", ", ".join(each), spread))
+    header = ("data", "agent", "gradient steps", "last score of each seed", "sample standard deviation")
+    return TextTable(header, tuple(rows), "Seeds in order.") if rows else None
+
+
 def long_table(evidence: Evidence) -> TextTable:
     """
     Results for programs, to four decimals, with runs of every length instead of the row's alone.

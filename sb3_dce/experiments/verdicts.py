@@ -464,6 +464,13 @@ def _alpha_return(evidence: Evidence) -> list[Verdict]:
         "score of Eq. 18 clearly below its score at alpha 1 and below half of it, or it diverges; that of DCE not below half, "
         f"nor below {WORKING:g}"
     )
+
+    def in_its_units(alpha: int, *compared: Values | None) -> str:
+        """Eq. 18 has c 0.5 and so twice DCE's penalty: DCE with the same one stands beside what is judged."""
+        same = values_of(evidence, [f"DCE c 0.5, alpha {alpha}"], "score")
+        beside = f"; with Eq. 18's penalty, {same.text()}" if same is not None else "; DCE has half of Eq. 18's penalty"
+        return text_of(*compared) + beside if any(values is not None for values in compared) else ""
+
     return [
         judge(
             "At alpha 3 both are below alpha 1",
@@ -475,9 +482,9 @@ def _alpha_return(evidence: Evidence) -> list[Verdict]:
             "At alpha 3 DCE is above Eq. 18",
             f"scores, clearly ({TENTH})",
             above(both, "DCE, alpha 3", "Eq. 18, alpha 3"),
-            text_of(both),
+            in_its_units(3, both),
         ),
-        judge("At alpha 5 Eq. 18 fails and DCE works", f"{rule} ({TENTH})", outcome, text_of(works, fails)),
+        judge("At alpha 5 Eq. 18 fails and DCE works", f"{rule} ({TENTH})", outcome, in_its_units(5, works, fails)),
     ]
 
 
