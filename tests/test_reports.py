@@ -227,6 +227,20 @@ def test_all_columns_of_the_long_table_are_over_the_same_seeds() -> None:
     assert (row["mean"], row["mean_best_evaluation"], row["mean_last_10_evaluations"]) == ("110.5000", "110.5000", "65.5000")
 
 
+def test_critics_that_run_away_are_marked() -> None:
+    facts = {"data_reward_abs_max": [2.0], "q_data": [2100.0]}  # ten times the largest return is 2000
+    runs = [
+        run_rows(TABLE, "TD3-BC", CHEETAH, 0, 40.0, facts),
+        run_rows(TABLE, "DCE", CHEETAH, 0, 40.0, {**facts, "q_data": [1900.0]}),
+    ]
+    rows = results.merge(runs)
+    rows.loc[rows["metric"] == "data_reward_abs_max", "step"] = 0
+    table = score_table(evidence_of(rows))
+    assert cell(table, CHEETAH, "ours: TD3-BC") == "40.0 †" and cell(table, CHEETAH, "ours: DCE") == "40.0"
+    assert "†: the critics diverge" in table.caption
+    assert "†" not in score_table(evidence_of(rows[rows["metric"] != "q_data"])).caption
+
+
 def test_scores_stand_seed_by_seed_where_there_are_several() -> None:
     rows = table_rows(TABLE, {CHEETAH: {"DCE": [15.0, 0.0, 3.0], "BC": [40.0]}})
     longer = table_rows(TABLE, {CHEETAH: {"DCE": [50.0]}}, n_updates=2000)

@@ -38,6 +38,7 @@ UPDATES_PER_EPOCH = 1000
 TAIL = 0.1  # share of a run, from its end, that stands for what it has become
 N_JUMPS = 3  # last evaluations of a run, by which it is seen how far its score moves between two
 N_LATE = 10  # last evaluations, whose mean stands beside the last score of a run
+OVERVALUED = 10.0  # times the largest return, from which on Q says that critics diverge
 GAMMA, TAU = 0.99, 0.005  # of all DCE runs of the figures (paper, common configuration)
 
 
@@ -431,6 +432,22 @@ class Evidence:
         rows = self.rows_of(variant, dataset_id)
         values = rows[(rows["metric"] == metric) & (rows["step"] == 0)]["value"]
         return float(values.iloc[0]) if len(values) else None
+
+    def overvalues(self, variant: Variant, dataset_id: str) -> bool:
+        """
+        Whether critics have run away without a number that is not finite: such a score is that of a failed run.
+
+        :param variant: of the experiment
+        :param dataset_id: data
+        :return: whether mean Q on the data ends beyond ten times the largest return that the rewards allow, as training warns;
+            false where rewards are scaled, or the run noted neither
+        """
+        settings = settings_in_force(variant, dataset_id, self.scale)
+        q_data, largest = self.tail(variant, dataset_id, "q_data"), self.start(variant, dataset_id, "data_reward_abs_max")
+        if q_data is None or largest is None or settings["reward_normalization"] is not None:
+            return False
+        largest = settings["reward_scale"] * largest + abs(settings["reward_shift"])
+        return abs(q_data) > OVERVALUED * largest / (1.0 - settings["gamma"])
 
     def n_diverged(self, variant: Variant, dataset_id: str) -> int:
         """

@@ -53,6 +53,7 @@ TIMING = "run-times"
 # Diagnostics that figures, verdicts and the search for causes read, by their names in the log.
 CURVES = ("q_data", "q_policy", "value", "gap_td", "ent_coef", "beta_eff", "survival_margin", "action_dist", "entropy", "adv")
 PROBE_CURVE = re.compile(r"probe\d+_(data|policy|init|best|max|min|rank)")
+DATA_FACTS = ("rows", "reward_mean", "reward_abs_max", "n_terminals")
 # A curve of diagnostics has at most POINTS points, each the mean since the last; a short run has wider gaps than FINEST steps
 # only for FEWEST_POINTS.
 POINTS, FEWEST_POINTS, FINEST = 100, 25, 2000
@@ -309,7 +310,7 @@ def _facts(
     data: dict[str, Any], result: dict[str, Any] | None, divergence: dict[str, Any] | None, n_updates: int
 ) -> list[tuple[int, str, float]]:
     """Numbers of the whole run, at its last step; of its data, at step 0."""
-    facts = [(0, f"data_{name}", float(data[name])) for name in ("rows", "reward_mean", "n_terminals") if name in data]
+    facts = [(0, f"data_{name}", float(data[name])) for name in DATA_FACTS if name in data]
     if divergence is not None:
         facts.append((int(divergence["n_updates"]), "diverged", 1.0))
     elif result is not None:

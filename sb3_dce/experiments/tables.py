@@ -7,7 +7,7 @@ import pandas as pd
 
 from sb3_dce.data.catalog import resolve
 from sb3_dce.experiments.captions import caption
-from sb3_dce.experiments.evidence import N_LATE, Evidence, at_end, curve_of, n_diverged_in, of_seeds_that_ended
+from sb3_dce.experiments.evidence import N_LATE, OVERVALUED, Evidence, at_end, curve_of, n_diverged_in, of_seeds_that_ended
 from sb3_dce.experiments.grid import Variant, source_of
 from sb3_dce.experiments.paper import MIXED_PROTOCOLS, paper_score, paper_total
 from sb3_dce.experiments.statistics import (
@@ -28,6 +28,7 @@ BOLD_RULE = (
     "seed. ± is the sample standard deviation over seeds, whose number stands where it differs from the row's commonest. "
     "'After n' are runs of another length than those of the row."
 )
+MARK = "†"
 
 # A probability from fewer comparisons of single runs says nothing.
 FEWEST_PAIRS = 5
@@ -64,7 +65,12 @@ def score_table(evidence: Evidence) -> TextTable:
         "DCE has the paper's row of each dataset; the paper tuned these by evaluating online. 'One setting' has its commonest "
         "row everywhere; up to the first change of beta, after 50,000 steps, both are one agent where the row begins alike."
     )
-    return TextTable(header, tuple(rows), f"{caption(evidence, ids)} {BOLD_RULE} {tuned} {MIXED_PROTOCOLS}")
+    failed = (
+        f" {MARK}: the critics diverge, their mean Q on the data ends beyond {OVERVALUED:g} times the largest return that the "
+        "rewards allow, max |r| / (1 - gamma)."
+    )
+    marked = failed if any(cell.endswith(MARK) for row in rows for cell in row) else ""
+    return TextTable(header, tuple(rows), f"{caption(evidence, ids)} {BOLD_RULE}{marked} {tuned} {MIXED_PROTOCOLS}")
 
 
 def _total_rows(evidence: Evidence, methods: list[str]) -> list[tuple[str, ...]]:
@@ -116,7 +122,7 @@ def score_cell(evidence: Evidence, variant: Variant, dataset_id: str, best: Inte
         text = f"**{text}**"
     if len(scores) != usual:
         text += f" ({_seeds(scores)})"
-    return text + lost
+    return text + lost + (f" {MARK}" if evidence.overvalues(variant, dataset_id) else "")
 
 
 def _cell_of_other_length(rows: pd.DataFrame, usual: int) -> str:
