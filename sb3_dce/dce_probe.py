@@ -59,14 +59,14 @@ class ProbePolicy(OfflineSACPolicy):
 
 def rank_correlation(x: th.Tensor, y: th.Tensor) -> th.Tensor:
     """
-    Spearman's rank correlation; equal numbers, which critics as good as never give, get ranks in the order of their rows.
+    Spearman's rank correlation; equal numbers, as of a row that a batch holds twice, get ranks in the order of their rows.
 
     :param x: shape (n,)
     :param y: shape (n,)
     :return: 0-dimensional, from -1 to 1; 1 for a single row
     """
     n = len(x)
-    ranks = [values.argsort().argsort().to(x.dtype) for values in (x, y)]
+    ranks = [values.argsort(stable=True).argsort(stable=True).to(x.dtype) for values in (x, y)]
     return 1.0 - 6.0 * (ranks[0] - ranks[1]).square().sum() / max(n * (n * n - 1), 1)
 
 
@@ -78,8 +78,8 @@ class OfflineDCEProbe(OfflineDCE):
     ``probe<beta>_policy`` Q of the current policy's, ``probe<beta>_init`` and ``probe<beta>_best`` Q of the actions of two
     frozen policies, the one at the start and one given later, and ``probe<beta>_max``, ``probe<beta>_min``: in each state
     the larger and the smaller of these two. All are means over batch and critics, in reward units. ``probe<beta>_rank`` says
-    how alike the set and the agent's own order the data's actions: rank correlation of Q - V over the batch, critic by critic.
-    ``probe0_rank`` is that of the first and the last of the agent's own critics, which differ in their first weights alone.
+    how alike the set and the agent's own order the data's actions: rank correlation of Q - V over the batch, of each critic
+    with another one of the agent's own, so that for beta 0, too, the two began with other weights.
 
     ``actor_best`` equals the start until :meth:`set_best_policy`. Parameters are described in :class:`~sb3_dce.dce.OfflineDCE`
     and :class:`~sb3_dce.base.OfflineAlgorithm`.
@@ -176,7 +176,7 @@ class OfflineDCEProbe(OfflineDCE):
             new, metrics = dce_update(state, batch, noise, coef, with_actor=with_actor)
             s = batch.observations
             actions = [th.tanh(actor(state[f"actor_{name}"], s)[0]) for name in PROBE_POLICIES]
-            own_advantages: list[th.Tensor] = []
+            others: list[th.Tensor] = []
             for beta in (0, *PROBE_BETAS):
                 names = {network: probe_name(network, beta) for network in TRAINED}
                 found = metrics
@@ -190,8 +190,8 @@ class OfflineDCEProbe(OfflineDCE):
                 largest, smallest = th.maximum(*q_ood), th.minimum(*q_ood)
                 v = value_net(state[names["value_net"]].params, s)
                 advantages = [(q - v).flatten() for q in critic(params, s, batch.actions)]
-                own_advantages = own_advantages or advantages
-                pairs = zip(advantages, own_advantages, strict=True) if beta else [(advantages[0], advantages[-1])]
+                others = others or [*advantages[1:], advantages[0]]
+                ranks = [rank_correlation(*pair) for pair in zip(advantages, others, strict=True)]
                 metrics.update(
                     {
                         f"probe{beta}_data": found["q_data"],
@@ -199,7 +199,7 @@ class OfflineDCEProbe(OfflineDCE):
                         **{f"probe{beta}_{name}": q.mean() for name, q in zip(PROBE_POLICIES, q_ood, strict=True)},
                         f"probe{beta}_max": largest.mean(),
                         f"probe{beta}_min": smallest.mean(),
-                        f"probe{beta}_rank": th.stack([rank_correlation(*pair) for pair in pairs]).mean(),
+                        f"probe{beta}_rank": th.stack(ranks).mean(),
                     }
                 )
             return new, metrics

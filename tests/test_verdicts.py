@@ -188,7 +188,7 @@ def test_values_outside_of_the_data_are_ordered_by_beta(sign: float, outcome: st
 
 @pytest.mark.parametrize(
     ("ranks", "outcome"),
-    [((0.5, 0.9, 0.8, 0.7, 0.5), HELD), ((0.5, 0.9, 0.8, 0.7, 0.46), CLOSE), ((0.5, 0.44, 0.9, 0.9, 0.9), NOT_HELD)],
+    [((0.5, 0.5, 0.5, 0.48, 0.41), HELD), ((0.5, 0.5, 0.5, 0.48, 0.39), NOT_HELD), ((0.9, 0.75, 0.9, 0.9, 0.9), NOT_HELD)],
 )
 def test_order_of_the_data_is_measured_against_that_of_two_critics_of_beta_0(ranks: Any, outcome: str) -> None:
     curves = {f"probe{b}_rank": [0.0] * 9 + [rank] for b, rank in zip((0, 1, 2, 4, 8), ranks, strict=True)}

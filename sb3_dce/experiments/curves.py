@@ -70,7 +70,7 @@ def probe_curve(evidence: Evidence, probe: Variant, dataset_id: str, metric: str
     :param probe: its variant
     :param dataset_id: data
     :param metric: "probe_policy" (against the critics with beta 0), "probe_max" or "probe_min" (against the data's actions);
-        "probe_rank" is shown as logged: how alike beta and beta 0 order the data's actions, for 0 how alike its two critics do
+        "probe_rank" is shown as logged: how alike a critic of beta and another one of beta 0 order the data's actions
     :param beta: of the critics, one of ``PROBE_BETAS`` or 0
     :return: reward units, or a correlation; steps by seeds
     """

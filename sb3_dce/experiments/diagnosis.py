@@ -12,14 +12,12 @@ import pandas as pd
 from sb3_dce.experiments.captions import caption_of
 from sb3_dce.experiments.evidence import Evidence, mean_over_seeds
 from sb3_dce.experiments.grid import Variant
-from sb3_dce.experiments.judging import CLEARLY, CLOSE, Uncertainty, differs, uncertainty
+from sb3_dce.experiments.judging import CLEARLY, CLOSE, GAP, Uncertainty, differs, uncertainty
 from sb3_dce.experiments.text_table import TextTable
 
 # A change counts as a cause if it closes this share of the distance to the better of BC and IQL.
 SHARE = 0.5
 RIVALS = ("BC", "IQL")
-# Q on the data that is further from its target than this share of the shift is not near it.
-GAP = 0.2
 
 
 def score_of(evidence: Evidence, variant: Variant, dataset_id: str) -> float | None:
@@ -159,7 +157,7 @@ def verdict_of(evidence: Evidence, dataset_id: str) -> str:
     excluded += lost
     gap_td, unit = (evidence.tail(variant, dataset_id, metric) for metric in ("gap_td", "beta_eff"))
     if gap_td is not None and unit and abs(gap_td) > GAP * unit:
-        excluded.append(f"gap_td {gap_td:.2f} is more than {GAP:.0%} of beta_eff")
+        excluded.append(f"gap_td is {abs(gap_td) / unit:.0%} of beta_eff, so that the shift is not checked there")
     if not causes or not (changed or lost):
         excluded.insert(0, "none of the changes explains it" if changed or lost else "no change was run")
     behind = f"behind {best} by {gap:.1f}" + (", which seeds can do" if close else "")

@@ -31,7 +31,7 @@ LABELS = {
     "probe_policy": r"$Q_\beta(s, a_\pi)$ - $Q_0(s, a_\pi)$",
     "probe_max": "max OOD Q - in-data Q",
     "probe_min": "min OOD Q - in-data Q",
-    "probe_rank": r"rank correlation of $Q_\beta - V_\beta$ and $Q_0 - V_0$",
+    "probe_rank": r"rank correlation of $Q_\beta - V_\beta$ with another $Q_0 - V_0$",
 }
 WIDTH, HEIGHT, COLUMNS = 4.6, 4.2, 3
 SMALLEST_RANGE = 10.0  # of an axis of scores

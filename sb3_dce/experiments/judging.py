@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_dce.experiments.evidence import Evidence
+from sb3_dce.experiments.evidence import N_JUMPS, Evidence
 from sb3_dce.experiments.grid import Variant
 from sb3_dce.experiments.paper import PAPER_SEEDS, paper_score
 from sb3_dce.experiments.statistics import sample_std
@@ -34,6 +34,8 @@ CLEARLY = (
 )
 # Seeds from which on an agent's own deviation is taken.
 FEWEST_OWN = 3
+# A mean of Q that is nearer to its target than this share of beta_eff bears out that the penalty shifts it by beta_eff.
+GAP = 0.2
 # Below this score a policy does not do its task, so that comparisons of it say nothing.
 WORKING = 5.0
 
@@ -161,7 +163,9 @@ def uncertainty(evidence: Evidence, variant: Variant, dataset_id: str) -> Uncert
     papers = {evidence.paper_id(dataset) for dataset, name in evidence.table_rows() if name == dataset_id}
     cells = [paper_score(paper, "DCE") for paper in papers]
     known = [cell.std for cell in cells if cell is not None and cell.std is not None]
-    largest = max([SEED_STD, evidence.largest_spread(dataset_id), evidence.jumps(variant, dataset_id), *known])
+    largest, jumps = max([SEED_STD, evidence.largest_spread(dataset_id), *known]), evidence.jumps(variant, dataset_id)
+    if jumps > largest:
+        return Uncertainty(jumps / math.sqrt(n), n * (N_JUMPS - 1))
     return Uncertainty(largest / math.sqrt(n), SEED_STD_FREEDOM, borrowed=True)
 
 
@@ -204,7 +208,7 @@ def spreads_beyond(spreads: Mapping[str, np.ndarray], limit: float, *named: str)
 
     :param spreads: scores by data, one per seed
     :param limit: of their standard deviation
-    :param named: beginnings of the data on which the paper has it; without any of these nothing is said against it
+    :param named: beginnings of the ids of the data on which the paper has it; without any of these nothing is said against it
     :return: whether it is above on some data, false if it is below on all, by its 95 % interval, divided among the data;
         ``CLOSE`` if neither; ``None`` without the data that are needed, with as many seeds as the paper's
     """

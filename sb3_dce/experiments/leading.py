@@ -103,15 +103,23 @@ class Field:
         Agents that are above DCE by more than seeds could do, whether the others have runs or not.
 
         :param dataset_id: data
-        :return: names; "nobody, but DCE diverged" if it has failed, having diverged on a seed, and no agent is above it
+        :return: names
         """
-        names = [v.name for v in self.others if self._is_above(v, self.dce, dataset_id)]
-        return names or (["nobody, but DCE diverged"] if self.evidence.n_diverged(self.dce, dataset_id) else [])
+        return [v.name for v in self.others if self._is_above(v, self.dce, dataset_id)]
 
     @property
-    def beaten(self) -> dict[str, list[str]]:
-        """By data on which DCE's schedule has begun the agents ahead of it; data without any are left out."""
-        return {name: found for name in self.ids if name not in self.too_short and (found := self.ahead(name))}
+    def counted(self) -> list[str]:
+        """The data on which DCE's schedule of beta, where it has one, has begun."""
+        return [name for name in self.ids if name not in self.too_short]
+
+    def has_failed(self, dataset_id: str) -> bool:
+        """
+        Whether DCE diverged on a seed.
+
+        :param dataset_id: data
+        :return: true, too, if no other agent has runs
+        """
+        return self.evidence.n_diverged(self.dce, dataset_id) > 0
 
     def _is_above(self, one: Variant, other: Variant, dataset_id: str) -> bool:
         lost = [self.evidence.n_diverged(v, dataset_id) > 0 for v in (one, other)]
@@ -151,7 +159,8 @@ def _is_best(claim: str, field: Field) -> Verdict:
         f"an agent is clearly above it, or it diverged; {BEGUN}; {DIVIDED}"
     )
     holds: bool | str | None = None
-    if field.beaten:  # missing agents and data can only add to those that are ahead
+    # missing agents and data can only add to those that are ahead
+    if any(field.ahead(name) or field.has_failed(name) for name in field.counted):
         holds = False
     elif field.is_complete:
         holds = True if all(map(field.is_first, field.ids)) else CLOSE
@@ -167,7 +176,7 @@ def _has_no_advantage(claim: str, field: Field) -> Verdict:
     holds: bool | None = None
     if field.is_complete and any(map(field.is_first, field.ids)):
         holds = False
-    elif field.n_wanted == len(field.beaten):
+    elif field.n_wanted == sum(bool(field.ahead(name)) for name in field.counted):
         holds = True
     elif field.is_complete:
         seeds = [len(field.evidence.last(v, name)) for v in field.agents for name in field.ids]

@@ -13,7 +13,6 @@ from sb3_dce.experiments.claims import claim_table, own_table_facts
 from sb3_dce.experiments.evidence import Evidence, runs_in
 from sb3_dce.experiments.judging import CLEARLY, Verdict
 from sb3_dce.experiments.reports import Report, count
-from sb3_dce.experiments.results import RUN_KEY
 from sb3_dce.experiments.tables import parts_of
 from sb3_dce.experiments.text_table import TextTable
 from sb3_dce.files import check_writable, write_text
@@ -99,23 +98,21 @@ def write_page(
 
 def usual_runs(evidences: Mapping[str, Evidence]) -> str:
     """
-    How large the page's evidence is, in a clause: the commonest length of its runs, and how many have one seed.
+    How large the page's evidence is, in a clause.
 
     :param evidences: by experiment
-    :return: such as "most runs have 50,000 steps (150 of 210)"; that there are none, without any
+    :return: the commonest length of its runs, and how many agents have one seed on a data set; that there are no runs
     """
     runs = [runs_in(e.every_run(name, e.experiment.variants)) for e in evidences.values() for _, name in e.table_rows()]
     found = pd.concat(runs).drop_duplicates() if runs else pd.DataFrame()
     if not len(found):
         return "there are no runs yet"
-    lengths, cells = (
-        found["n_updates"].value_counts(),
-        found.groupby([c for c in RUN_KEY if c != "seed"], observed=True).size(),
-    )
+    lengths = found["n_updates"].value_counts()
+    seeds = found.groupby(["dataset", "agent", "config_hash"], observed=True)["seed"].nunique()
     usual = max(lengths.index, key=lambda n: (lengths[n], n))
     return (
-        f"most have {usual:,} steps ({lengths[usual]} of {len(found)} runs) and one seed ({(cells == 1).sum()} of "
-        f"{len(cells)} agents on a set)"
+        f"{usual:,} steps are commonest ({lengths[usual]} of {len(found)} runs), and one seed ({(seeds == 1).sum()} of "
+        f"{len(seeds)} pairs of agent and data)"
     )
 
 
