@@ -11,6 +11,7 @@ from sb3_dce.divergence import Rewind, not_finite
 from sb3_dce.errors import DivergenceError, SB3DCEWarning
 from sb3_dce.execution import Engine
 from sb3_dce.state import TrainState
+from sb3_dce.theory import Q_LIMIT, q_limit
 
 # There as soon as a row of the log has its diagnostics.
 RECORDED = "train/n_updates"
@@ -80,17 +81,17 @@ class DiagnosticsMixin(AttachingMixin):
         self._warn_of_large_values(metrics)
 
     def _warn_of_large_values(self, metrics: dict[str, float]) -> None:
-        if self._warned_large_q or self.dataset_statistics is None or self.gamma >= 1.0:
+        if self._warned_large_q or self.dataset_statistics is None:
             return
         largest = self._reward_factor() * self.dataset_statistics["reward_abs_max"] + abs(self.reward_shift)
-        bound = 10.0 * largest / (1.0 - self.gamma)
+        bound = q_limit(largest, self.gamma)
         # of the policy's actions it can run away alone, where these are far from the data's
         places = {"on the data": metrics.get("q_data", 0.0), "of the policy's actions": metrics.get("q_policy", 0.0)}
         where = max(places, key=lambda place: abs(places[place]))
         if abs(places[where]) > bound:
             self._warned_large_q = True
             warnings.warn(
-                f"mean Q {where} is {places[where]:.3g} after {self._n_updates} updates, beyond 10 times the largest "
+                f"mean Q {where} is {places[where]:.3g} after {self._n_updates} updates, beyond {Q_LIMIT:g} times the largest "
                 f"return the rewards allow ({bound:.3g}): the critics are diverging. Try a smaller "
                 f"learning_rate{' or a larger beta' if hasattr(self, 'beta') else ''}.",
                 SB3DCEWarning,

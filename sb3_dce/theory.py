@@ -6,6 +6,20 @@ import math
 
 from sb3_dce.errors import ConfigError
 
+# Times the largest return that rewards allow: a mean of Q beyond that says that critics run away.
+Q_LIMIT = 10.0
+
+
+def q_limit(largest_reward: float, gamma: float) -> float:
+    """
+    Largest mean of Q that critics may have before they are taken to diverge, ``Q_LIMIT * max |r| / (1 - gamma)``.
+
+    :param largest_reward: absolute, of the rewards that the agent is trained on
+    :param gamma: discount factor
+    :return: reward units; infinite without a discount
+    """
+    return Q_LIMIT * largest_reward / (1.0 - gamma) if gamma < 1.0 else math.inf
+
 
 def beta_eff(beta: float, td_loss_coef: float) -> float:
     """

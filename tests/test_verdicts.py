@@ -62,7 +62,7 @@ def scored(name: str, by_data: dict[str, dict[str, float]], metric: str = "score
         ("fig-beta", "score", {"beta 0": 60, "BC": 40}, "With beta 0 the agent does badly"),
         ("fig-beta", "score", {"beta 0": 10, "SAC without V": 40}, "better than SAC without V"),
         ("fig-sac", "q_data", {"SAC, alpha 1": 100, "SAC with V, alpha 1": 60}, "far lower (paper: 4000 and 400), alpha 1"),
-        ("fig-alpha", "ent_coef", {f"beta {b}": 1 - b / 10 for b in (0, 1, 2, 4, 8)}, f"within a range, on {CHEETAH}"),
+        ("fig-alpha", "ent_coef", {f"beta {b}": 1 - b / 10 for b in (0, 1, 2, 4, 8)}, f"(paper: within a range) on {CHEETAH}"),
         (
             "fig-tau",
             "score",
@@ -123,7 +123,7 @@ def test_two_agents_that_fail_are_not_compared(name: str, values: dict[str, floa
     ("alphas", "outcome"),
     [
         ((0.50, 0.52, 0.54, 0.56, 0.58), CLOSE),
-        ((0.50, 0.54, 0.58, 0.62, 0.66), HELD),  # no step of it is more than seeds can do, the whole is
+        ((0.50, 0.55, 0.60, 0.65, 0.70), HELD),  # no step of it is more than seeds can do, the whole is
         ((0.5, 0.6, 0.4, 0.9, 1.0), NOT_HELD),
     ],
 )
@@ -132,15 +132,15 @@ def test_alpha_rises_by_more_than_seeds_can_do(alphas: tuple[float, ...], outcom
     values = {f"beta {b}": alpha for b, alpha in zip((0, 1, 2, 4, 8), alphas, strict=True)}
     both = {CHEETAH: values, replay: {"beta 1": 0.3, "beta 4": 0.1}}
     found = outcomes("fig-alpha", scored("fig-alpha", both, "ent_coef"))
-    assert one_of(found, f"rises with beta, within a range, on {CHEETAH}") == outcome
-    assert one_of(found, f"rises with beta, within a range, on {replay}") == NOT_HELD, "each set is a matter of its own"
+    assert one_of(found, f"rises with beta (paper: within a range) on {CHEETAH}") == outcome
+    assert one_of(found, f"rises with beta (paper: within a range) on {replay}") == NOT_HELD, "each set is a matter of its own"
 
 
 def test_set_without_all_betas_is_not_tested_but_refutes() -> None:
     for values, outcome in (((0.3, 0.9), UNTESTED), ((0.5, 0.5), UNTESTED), ((0.9, 0.3), NOT_HELD)):
         two = {CHEETAH: dict(zip(("beta 1", "beta 4"), values, strict=True))}
         found = outcomes("fig-alpha", scored("fig-alpha", two, "ent_coef"))
-        assert one_of(found, f"within a range, on {CHEETAH}") == outcome
+        assert one_of(found, f"(paper: within a range) on {CHEETAH}") == outcome
 
 
 def test_seeds_that_agree_tell_a_smaller_difference() -> None:
@@ -168,7 +168,12 @@ def test_seeds_that_agree_tell_a_smaller_difference() -> None:
         ("fig-beta", "score", {"beta 0": 10, "BC": 40}, "With beta 0 the agent does badly"),
         ("fig-beta", "score", {"beta 0": 60, "SAC without V": 40}, "better than SAC without V"),
         ("fig-sac", "q_data", {"SAC, alpha 1": 100, "SAC with V, alpha 1": 40}, "far lower (paper: 4000 and 400), alpha 1"),
-        ("fig-alpha", "ent_coef", {f"beta {b}": (b + 1) / 10 for b in (0, 1, 2, 4, 8)}, f"within a range, on {CHEETAH}"),
+        (
+            "fig-alpha",
+            "ent_coef",
+            {f"beta {b}": (b + 1) / 10 for b in (0, 1, 2, 4, 8)},
+            f"(paper: within a range) on {CHEETAH}",
+        ),
     ],
 )
 def test_claims_hold_on_numbers_that_bear_them_out(name: str, metric: str, values: dict[str, float], claim: str) -> None:
@@ -207,7 +212,6 @@ def test_bound_and_shift_are_judged_by_the_worst_beta(factors: tuple[float, ...]
         parts.append(run_rows(experiment, variant.name, CHEETAH, 0, curves=curves, n_updates=100_000))
     found = outcomes("bounds", results.merge(parts))
     assert one_of(found, "Q on the data is lowered") == outcome
-    assert one_of(found, "at most the bound") == UNTESTED, "its density ratio is not known"
 
 
 @pytest.mark.parametrize(
@@ -254,6 +258,8 @@ def test_claim_on_seeds() -> None:
         return {row[0]: row[2] for row in claim_table({"table1": evidence}, {}).rows}["C7"]
 
     assert outcome(runs(hopper, 30.0, 5)) == HELD
+    assert outcome(runs(hopper, 12.3 / np.std(range(5), ddof=1), 5)) == HELD, "the paper's own spread there"
+    assert outcome(runs(hopper, 5.0, 5)) == CLOSE
     assert outcome(runs(hopper, 1.0, 5)) == NOT_HELD
     assert outcome([*runs(CHEETAH, 1.0, 5), *runs(hopper, 30.0, 2)]) == UNTESTED, "two seeds of Hopper"
     assert outcome(runs(hopper, 30.0, 4)) == UNTESTED, "four seeds say little on a deviation"
@@ -305,12 +311,23 @@ def test_q_of_sac_that_diverged_is_compared_with_runs_that_are_there() -> None:
     assert one_of(outcomes("fig-sac", results.merge([sac, with_v])), "far lower (paper: 4000 and 400), alpha 1") == HELD
 
 
-def test_q_that_still_rises_has_no_level_to_compare() -> None:
+@pytest.mark.parametrize(
+    ("sac", "with_v", "outcome"),
+    [
+        ((400.0, 3.0), (390.0, 0.0), UNTESTED),  # SAC's may go on to more than twice
+        ((400.0, 0.1), (390.0, 0.0), NOT_HELD),
+        ((3000.0, 50.0), (400.0, 0.0), HELD),  # there what rises only makes it clearer
+        ((4000.0, 0.0), (1000.0, 30.0), UNTESTED),
+    ],
+)
+def test_q_whose_rise_could_turn_the_outcome_is_not_judged(
+    sac: tuple[float, float], with_v: tuple[float, float], outcome: str
+) -> None:
     experiment = load_experiment("fig-sac")
-    for slope, outcome in ((3.0, UNTESTED), (0.1, NOT_HELD)):
-        curves = {"SAC, alpha auto": [400.0 + slope * i for i in range(20)], "SAC with V, alpha auto": [390.0] * 20}
-        runs = [run_rows(experiment, n, CHEETAH, 0, curves={"q_data": q}, n_updates=200_000) for n, q in curves.items()]
-        assert one_of(outcomes("fig-sac", results.merge(runs)), "(paper: 4000 and 400), alpha auto") == outcome
+    courses = {"SAC, alpha auto": sac, "SAC with V, alpha auto": with_v}
+    curves = {name: [start + slope * i for i in range(20)] for name, (start, slope) in courses.items()}
+    runs = [run_rows(experiment, n, CHEETAH, 0, curves={"q_data": q}, n_updates=200_000) for n, q in curves.items()]
+    assert one_of(outcomes("fig-sac", results.merge(runs)), "(paper: 4000 and 400), alpha auto") == outcome
 
 
 @pytest.mark.parametrize(("n_updates", "outcome"), [(99_000, UNTESTED), (100_000, NOT_HELD)])
@@ -424,10 +441,17 @@ def test_single_runs_spread_on_each_data_set_as_the_papers_dce() -> None:
 
 def test_a_curve_that_jumps_tells_little() -> None:
     experiment = load_experiment("fig-cql-return")
-    for jump, outcome in ((0.0, HELD), (20.0, CLOSE)):
-        curves = {"DCE": [40.0 - jump, 40.0 + jump, 40.0], "Eq. 18": [70.0] * 3}
+    # a deviation of 6.5 of three evaluations has two degrees of freedom; with four the difference would be clear
+    for jump, outcome in ((0.0, HELD), (6.5, CLOSE)):
+        curves = {"DCE": [40.0 - jump, 40.0 + jump, 40.0], "Eq. 18": [61.8] * 3}
         runs = [run_rows(experiment, name, CHEETAH, 0, curves={"score": curve}) for name, curve in curves.items()]
         assert one_of(outcomes("fig-cql-return", results.merge(runs)), "Eq. 18 is better on halfcheetah") == outcome
+
+
+def test_no_advantage_is_not_shown_by_runs_that_diverged_alone() -> None:
+    experts = [f"{task}-medium-expert-sb3" for task in ("halfcheetah", "hopper", "walker2d")]
+    rows = results.merge(lost("table1", "DCE", name).assign(n_updates=100_000) for name in experts)
+    assert one_of(outcomes("table1", rows), "C6") == UNTESTED
 
 
 def test_first_by_a_hair_is_not_best() -> None:
@@ -486,11 +510,10 @@ def test_alpha_differs_between_data_sets_by_a_factor(alphas: tuple[float, ...], 
     assert one_of(outcomes("fig-alpha", rows), "between data sets (MuJoCo)") == UNTESTED, "two sets of one task"
 
 
-@pytest.mark.parametrize(("size", "outcome"), [(0.5, HELD), (2.0, NOT_HELD), (0.97, CLOSE)])
-def test_flatter_curve_is_the_one_that_varies_less_about_its_trend(size: float, outcome: str) -> None:
+@pytest.mark.parametrize(("slope", "outcome"), [(0.5, HELD), (2.0, NOT_HELD), (0.97, CLOSE)])
+def test_flatter_curve_is_the_one_that_varies_less(slope: float, outcome: str) -> None:
     experiment = load_experiment("fig-cql-q")
-    wave = [float((-1) ** i) for i in range(25)]
-    curves = {"expectile 0.7": wave, "without policy": [size * w + 10.0 * i for i, w in enumerate(wave)]}
+    curves = {"expectile 0.7": [float(i) for i in range(25)], "without policy": [slope * i for i in range(25)]}
     for n_updates, expected in ((200_000, outcome), (100_000, UNTESTED)):  # before, Q is on the way to its level
         rows = [run_rows(experiment, n, CHEETAH, 0, curves={"q_data": q}, n_updates=n_updates) for n, q in curves.items()]
         assert one_of(outcomes("fig-cql-q", results.merge(rows)), "Q is flatter") == expected
@@ -498,7 +521,8 @@ def test_flatter_curve_is_the_one_that_varies_less_about_its_trend(size: float, 
 
 def test_curve_without_any_spread_is_the_flatter_one() -> None:
     experiment = load_experiment("fig-cql-q")
-    for size, outcome in ((1.0, HELD), (0.0, CLOSE)):
+    # a spread that no figure shows, below 2 % of Q, says nothing
+    for size, outcome in ((1.0, HELD), (0.0, CLOSE), (0.05, CLOSE)):
         curves = {"expectile 0.7": [5.0 + size * (-1) ** i for i in range(25)], "without policy": [5.0] * 25}
         rows = [run_rows(experiment, n, CHEETAH, 0, curves={"q_data": q}, n_updates=200_000) for n, q in curves.items()]
         assert one_of(outcomes("fig-cql-q", results.merge(rows)), "Q is flatter") == outcome

@@ -32,13 +32,12 @@ from sb3_dce.experiments.grid import (
     variant_hash,
 )
 from sb3_dce.experiments.results import RUN_KEY, TIMING
-from sb3_dce.theory import beta_eff, shift_factor, value_shift_factor
+from sb3_dce.theory import beta_eff, q_limit, shift_factor, value_shift_factor
 
 UPDATES_PER_EPOCH = 1000
 TAIL = 0.1  # share of a run, from its end, that stands for what it has become
 N_JUMPS = 3  # last evaluations of a run, by which it is seen how far its score moves between two
 N_LATE = 10  # last evaluations, whose mean stands beside the last score of a run
-OVERVALUED = 10.0  # times the largest return, from which on Q says that critics diverge
 GAMMA, TAU = 0.99, 0.005  # of all DCE runs of the figures (paper, common configuration)
 
 
@@ -350,9 +349,13 @@ class Evidence:
         :return: scores at the end of its longest runs, one per seed, and their gradient steps; ``None`` without scores, or
             if these steps are no more than the others have
         """
+        return _scores_and_length(self._longest(variant, dataset_id))
+
+    def _longest(self, variant: Variant, dataset_id: str) -> pd.DataFrame:
+        """Rows of the longest runs, if they are longer than the row's."""
         rows = self.rows_of_any_length(variant, dataset_id)
         rows = rows[rows["n_updates"] > (self.n_updates(dataset_id) or 0)]
-        return _scores_and_length(rows[rows["n_updates"] == rows["n_updates"].max()])
+        return rows[rows["n_updates"] == rows["n_updates"].max()]
 
     def late_mean_of_longer(self, variant: Variant, dataset_id: str) -> float | None:
         """
@@ -360,12 +363,12 @@ class Evidence:
 
         :param variant: of the experiment
         :param dataset_id: data
-        :return: normalised score, over seeds; ``None`` without such runs, or with fewer evaluations
+        :return: normalised score, over the seeds that have not diverged; ``None`` without such runs, or if ten evaluations are
+            all they have
         """
-        rows = self.rows_of_any_length(variant, dataset_id)
-        rows = rows[rows["n_updates"] > (self.n_updates(dataset_id) or 0)]
-        curve = curve_of(rows[rows["n_updates"] == rows["n_updates"].max()], "score")
-        return mean_over_seeds(curve.tail(N_LATE)) if len(curve) >= N_LATE else None
+        rows = self._longest(variant, dataset_id)
+        curve = of_seeds_that_ended(curve_of(rows, "score"), int(rows["n_updates"].max() if len(rows) else 0))
+        return mean_over_seeds(curve.tail(N_LATE)) if len(curve) > N_LATE else None
 
     def last_of_most_seeds(self, variant: Variant, dataset_id: str) -> tuple[np.ndarray, int] | None:
         """
@@ -435,19 +438,24 @@ class Evidence:
 
     def overvalues(self, variant: Variant, dataset_id: str) -> bool:
         """
-        Whether critics have run away without a number that is not finite: such a score is that of a failed run.
+        Whether critics have run away on any seed without a number that is not finite: such a score is that of a failed run.
 
         :param variant: of the experiment
         :param dataset_id: data
-        :return: whether mean Q on the data ends beyond ten times the largest return that the rewards allow, as training warns;
-            false where rewards are scaled, or the run noted neither
+        :return: whether the mean Q on the data ends beyond :func:`~sb3_dce.theory.q_limit`, in the runs that count or, without
+            any, those that the table shows instead; false where returns are normalised, whose factor is not among the rows
         """
+        rows = self.rows_of(variant, dataset_id)
+        rows = rows if len(rows) else self.of_other_length(variant, dataset_id)
         settings = settings_in_force(variant, dataset_id, self.scale)
-        q_data, largest = self.tail(variant, dataset_id, "q_data"), self.start(variant, dataset_id, "data_reward_abs_max")
-        if q_data is None or largest is None or settings["reward_normalization"] is not None:
+        largest = rows[(rows["metric"] == "data_reward_abs_max") & (rows["step"] == 0)]["value"]
+        curve = curve_of(rows, "q_data")
+        # BC has no critics, and so none of these settings
+        if curve.empty or not len(largest) or settings.get("reward_normalization", "none known") is not None:
             return False
-        largest = settings["reward_scale"] * largest + abs(settings["reward_shift"])
-        return abs(q_data) > OVERVALUED * largest / (1.0 - settings["gamma"])
+        limit = q_limit(settings["reward_scale"] * float(largest.max()) + abs(settings["reward_shift"]), settings["gamma"])
+        last = curve[curve.index > (1.0 - TAIL) * int(rows["n_updates"].iloc[0])]
+        return bool((last.mean().abs() > limit).any())
 
     def n_diverged(self, variant: Variant, dataset_id: str) -> int:
         """

@@ -100,7 +100,7 @@ class GridDataset:
 
         :return: "no data", how our data differ in kind, or "not run"
         """
-        return f"our data are of another kind: {self.note}" if self.other_kind and self.note else self.absence
+        return f"no runs; our data are of another kind: {self.note}" if self.other_kind and self.note else self.absence
 
 
 @dataclass(frozen=True)

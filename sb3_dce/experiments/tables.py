@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pandas as pd
 
 from sb3_dce.data.catalog import resolve
-from sb3_dce.experiments.captions import caption
-from sb3_dce.experiments.evidence import N_LATE, OVERVALUED, Evidence, at_end, curve_of, n_diverged_in, of_seeds_that_ended
-from sb3_dce.experiments.grid import Variant, source_of
+from sb3_dce.experiments.captions import caption, caption_of
+from sb3_dce.experiments.evidence import N_LATE, Evidence, at_end, curve_of, n_diverged_in, of_seeds_that_ended
+from sb3_dce.experiments.grid import Variant, agent_key, settings_in_force, source_of
 from sb3_dce.experiments.paper import MIXED_PROTOCOLS, paper_score, paper_total
 from sb3_dce.experiments.statistics import (
     N_RESAMPLES,
@@ -22,6 +24,7 @@ from sb3_dce.experiments.statistics import (
     total,
 )
 from sb3_dce.experiments.text_table import TextTable
+from sb3_dce.theory import Q_LIMIT
 
 BOLD_RULE = (
     "Bold: the 95 % interval over seeds (Student's t) overlaps that of the best mean of the row; none where that has one "
@@ -65,12 +68,17 @@ def score_table(evidence: Evidence) -> TextTable:
         "DCE has the paper's row of each dataset; the paper tuned these by evaluating online. 'One setting' has its commonest "
         "row everywhere; up to the first change of beta, after 50,000 steps, both are one agent where the row begins alike."
     )
-    failed = (
-        f" {MARK}: the critics diverge, their mean Q on the data ends beyond {OVERVALUED:g} times the largest return that the "
-        "rewards allow, max |r| / (1 - gamma)."
+    return TextTable(header, tuple(rows), f"{caption(evidence, ids)} {BOLD_RULE}{_mark_note(rows)} {tuned} {MIXED_PROTOCOLS}")
+
+
+def _mark_note(rows: Sequence[Sequence[str]]) -> str:
+    """What the mark says, if it is there."""
+    if not any(cell.endswith(MARK) for row in rows for cell in row):
+        return ""
+    return (
+        f" {MARK}: the critics diverge on a seed, their mean Q on the data ends beyond {Q_LIMIT:g} times the largest return "
+        "that the rewards allow, max |r| / (1 - gamma); totals and comparisons have these scores, too."
     )
-    marked = failed if any(cell.endswith(MARK) for row in rows for cell in row) else ""
-    return TextTable(header, tuple(rows), f"{caption(evidence, ids)} {BOLD_RULE}{marked} {tuned} {MIXED_PROTOCOLS}")
 
 
 def _total_rows(evidence: Evidence, methods: list[str]) -> list[tuple[str, ...]]:
@@ -92,7 +100,8 @@ def _total_rows(evidence: Evidence, methods: list[str]) -> list[tuple[str, ...]]
                 scores = [evidence.last(variant, name) for name in ids]
                 whole = len(ids) == len(wanted) and all(map(len, scores)) and len(lengths) == 1
                 whole = whole and not any(evidence.n_diverged(variant, name) for name in ids)
-                totals.append(f"{sum(task.mean() for task in scores):.1f}" if whole else "-")
+                mark = f" {MARK}" if any(evidence.overvalues(variant, name) for name in ids) else ""
+                totals.append(f"{sum(task.mean() for task in scores):.1f}{mark}" if whole else "-")
             label = f"total of {len(wanted)} {family} sets, {'D4RL' if source == 'D4RL' else 'our own'}"
             found.append((label, *totals, "", *(paper if source == "D4RL" else ("",) * len(paper))))
     return found
@@ -110,9 +119,10 @@ def score_cell(evidence: Evidence, variant: Variant, dataset_id: str, best: Inte
     :return: mean, deviation, number of seeds if it is not the usual one, and how many diverged; without runs of the row's
         length the same of its longest, marked as such, or "-"
     """
+    mark = f" {MARK}" if evidence.overvalues(variant, dataset_id) else ""
     longest = evidence.of_other_length(variant, dataset_id)
     if len(longest):
-        return _cell_of_other_length(longest, usual)
+        return _cell_of_other_length(longest, usual) + mark
     scores, diverged = evidence.last(variant, dataset_id), evidence.n_diverged(variant, dataset_id)
     lost = f" ({diverged} diverged)" if diverged else ""
     if not len(scores):
@@ -122,7 +132,7 @@ def score_cell(evidence: Evidence, variant: Variant, dataset_id: str, best: Inte
         text = f"**{text}**"
     if len(scores) != usual:
         text += f" ({_seeds(scores)})"
-    return text + lost + (f" {MARK}" if evidence.overvalues(variant, dataset_id) else "")
+    return text + lost + mark
 
 
 def _cell_of_other_length(rows: pd.DataFrame, usual: int) -> str:
@@ -280,9 +290,10 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
             chance = f"{probability_of_improvement([evidence.last(dce, name) for name in ids], scores):.2f}"
         printed = [None if variant.paper is None else paper_score(name, variant.paper) for name in paper_rows]
         known = [cell.score for cell in printed if cell is not None and cell.score is not None]
+        mark = f" {MARK}" if any(evidence.overvalues(variant, name) for name in ids) else ""
         rows.append(
             (
-                variant.name,
+                f"{variant.name}{mark}",
                 *(f"{sums.mean:.1f}", *spreads, f"{mean_of_tasks(scores):.1f}", f"{iqm(scores):.1f}"),
                 f"{low:.1f} to {high:.1f}" if all(len(task) > 1 for task in scores) else "-",
                 chance,
@@ -295,7 +306,7 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
         "half of the data are left out. An agent that diverged on a seed has no total. IQM is the mean of the middle half of "
         "all scores, P(DCE > agent) the share of pairs of runs on the same data in which DCE scores more. Each data set has "
         f"the same weight. The interval is a stratified bootstrap over seeds within data sets ({N_RESAMPLES:,} resamples; "
-        f"none with one seed); the deviation of the total takes the rows as independent. {MIXED_PROTOCOLS}"
+        f"none with one seed); the deviation of the total takes the rows as independent.{_mark_note(rows)} {MIXED_PROTOCOLS}"
     )
     return TextTable(header, tuple(rows), f"{caption(evidence, ids, variants)} {note}")
 
@@ -307,19 +318,30 @@ def seed_table(evidence: Evidence) -> TextTable | None:
     :param evidence: of an experiment with a table
     :return: one row per agent, data and length with two seeds or more; ``None`` without any
     """
-    rows = []
+    rows, shown, agents = [], [], []
     for dataset, name in evidence.table_rows():
-        # the columns of one agent, as "one setting" where it is the row's, are one
-        agents = {evidence.key_of(variant, name): variant for variant in reversed(evidence.variants(dataset))}
-        for variant in reversed(agents.values()):
-            for length, runs in evidence.rows_of_any_length(variant, name).groupby("n_updates"):
-                scores, lost = at_end(runs, "score"), n_diverged_in(runs)
-                if len(scores) + lost > 1:
-                    each = [*(f"{score:.1f}" for score in scores), *["diverged"] * lost]
-                    spread = f"{sample_std(scores):.1f}" if len(scores) > 1 else "-"
-                    rows.append((name, variant.name, f"{length:,}", ", ".join(each), spread))
-    header = ("data", "agent", "gradient steps", "last score of each seed", "sample standard deviation")
-    return TextTable(header, tuple(rows), "Seeds in order.") if rows else None
+        known: set[str] = set()
+        for variant in evidence.variants(dataset):
+            settings = settings_in_force(variant, name, evidence.scale)
+            every = evidence.rows_of_any_length(variant, name)
+            for length in sorted(every["n_updates"].unique()):
+                runs = every[every["n_updates"] == length]
+                agent = agent_key(variant.algo, settings, int(length)) + str(length)
+                ends = runs[(runs["metric"] == "score") & (runs["step"] == length) | (runs["metric"] == "diverged")]
+                if agent in known or ends["seed"].nunique() < 2:  # "one setting" is the same agent where it is the row's
+                    continue
+                known.add(agent)
+                shown.append(runs)
+                agents.append(variant)
+                ends = ends.sort_values(["seed", "metric"]).drop_duplicates("seed")  # "diverged" before "score"
+                each = ["diverged" if e.metric == "diverged" else f"{e.value:.1f}" for e in ends.itertuples()]
+                whole = ends[ends["metric"] == "score"]["value"].to_numpy(dtype=float)
+                spread = f"{sample_std(whole):.1f}" if len(whole) > 1 else "-"
+                rows.append((name, variant.name, f"{length:,}", ", ".join(each), spread))
+    if not rows:
+        return None
+    header = ("data", "agent", "gradient steps", "last score of each seed, in their order", "sample standard deviation")
+    return TextTable(header, tuple(rows), caption_of(evidence, pd.concat(shown), list(dict.fromkeys(agents))))
 
 
 def long_table(evidence: Evidence) -> TextTable:

@@ -65,6 +65,6 @@ class TextTable:
 def _latex(text: str) -> str:
     for sign in ("\\", "&", "%", "_", "#", "$", "{", "}"):
         text = text.replace(sign, r"\textbackslash " if sign == "\\" else f"\\{sign}")
-    text = text.replace("±", r"$\pm$").replace("…", r"\dots{}").replace("`", "").replace(">", "$>$")
+    text = text.replace("±", r"$\pm$").replace("…", r"\dots{}").replace("†", r"\dag{}").replace("`", "").replace(">", "$>$")
     parts = text.split("**")
     return "".join(rf"\textbf{{{part}}}" if i % 2 else part for i, part in enumerate(parts))
