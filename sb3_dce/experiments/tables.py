@@ -318,7 +318,7 @@ def seed_table(evidence: Evidence) -> TextTable | None:
     :param evidence: of an experiment with a table
     :return: one row per agent, data and length with two seeds or more; ``None`` without any
     """
-    rows, shown, agents = [], [], []
+    rows, shown = [], []
     for dataset, name in evidence.table_rows():
         known: set[str] = set()
         for variant in evidence.variants(dataset):
@@ -332,7 +332,6 @@ def seed_table(evidence: Evidence) -> TextTable | None:
                     continue
                 known.add(agent)
                 shown.append(runs)
-                agents.append(variant)
                 ends = ends.sort_values(["seed", "metric"]).drop_duplicates("seed")  # "diverged" before "score"
                 each = ["diverged" if e.metric == "diverged" else f"{e.value:.1f}" for e in ends.itertuples()]
                 whole = ends[ends["metric"] == "score"]["value"].to_numpy(dtype=float)
@@ -341,7 +340,8 @@ def seed_table(evidence: Evidence) -> TextTable | None:
     if not rows:
         return None
     header = ("data", "agent", "gradient steps", "last score of each seed, in their order", "sample standard deviation")
-    return TextTable(header, tuple(rows), caption_of(evidence, pd.concat(shown), list(dict.fromkeys(agents))))
+    agents = [v for v in evidence.experiment.variants if any(v.name == row[1] for row in rows)]
+    return TextTable(header, tuple(rows), caption_of(evidence, pd.concat(shown), agents))
 
 
 def long_table(evidence: Evidence) -> TextTable:
