@@ -197,8 +197,12 @@ def test_values_outside_of_the_data_are_ordered_by_beta(sign: float, outcome: st
 )
 def test_order_of_the_data_is_measured_against_that_of_two_critics_of_beta_0(ranks: Any, outcome: str) -> None:
     curves = {f"probe{b}_rank": [0.0] * 9 + [rank] for b, rank in zip((0, 1, 2, 4, 8), ranks, strict=True)}
-    found = outcomes("fig-ood", run_rows(load_experiment("fig-ood"), "probe", CHEETAH, 0, curves=curves))
-    assert one_of(found, "C1: the ranking") == outcome
+    experiment = load_experiment("fig-ood")
+    new, old = (run_rows(experiment, "probe", CHEETAH, seed, 1.0, curves if seed else {}) for seed in (1, 0))
+    assert one_of(outcomes("fig-ood", new), "C1: the ranking") == outcome
+    evidence = Evidence(experiment, results.merge([new, old]), experiment.scales["cpu"])  # the old one did not log it
+    (verdict,) = [v for v in verdicts(evidence) if v.claim.startswith("C1")]
+    assert verdict.outcome == outcome and verdict.numbers.endswith("1,000 steps, 1 seed)")
 
 
 @pytest.mark.parametrize(("factors", "outcome"), [((1.0, 1.0, 1.0), HELD), ((0.9, 1.0, 1.3), NOT_HELD)])

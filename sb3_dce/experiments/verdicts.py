@@ -200,10 +200,15 @@ def _probe_values(evidence: Evidence, metric: str) -> Values | None:
     for beta in (0, *PROBE_BETAS):
         if dataset_id is None:
             return None
-        value = evidence.tail_mean(probe_curve(evidence, probe, dataset_id, metric, beta), dataset_id)
+        curve = probe_curve(evidence, probe, dataset_id, metric, beta)
+        value = evidence.tail_mean(curve, dataset_id)
         if value is None:
             return None
         values[f"beta {beta}"] = value
+        n_seeds = curve.shape[1]
+        if n_seeds < len(evidence.last(probe, dataset_id)):  # earlier runs did not log the ranks
+            word = "seed" if n_seeds == 1 else "seeds"
+            values.scope = f"{dataset_id}, {evidence.n_updates(dataset_id):,} steps, {n_seeds} {word}"
     return values
 
 
