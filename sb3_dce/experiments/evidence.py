@@ -288,16 +288,17 @@ class Evidence:
         self._whole._same_agent[variant.name, dataset_id] = list(found.values())
         return self._whole._same_agent[variant.name, dataset_id]
 
-    def key_of(self, variant: Variant, dataset_id: str) -> str:
+    def key_of(self, variant: Variant, dataset_id: str, n_updates: int | None = None) -> str:
         """
         Text by which two variants are found to be one agent, as two schedules of beta that have not parted yet.
 
         :param variant: of the experiment
         :param dataset_id: data
-        :return: the same for variants that are one agent over the length of the runs there (over one step without any)
+        :param n_updates: over how many gradient steps; ``None`` for the length of the runs there (one step without any)
+        :return: the same for variants that are one agent over this length
         """
         settings = settings_in_force(variant, dataset_id, self.scale)
-        return agent_key(variant.algo, settings, self.n_updates(dataset_id) or 1)
+        return agent_key(variant.algo, settings, n_updates or self.n_updates(dataset_id) or 1)
 
     def rows_of_any_length(self, variant: Variant, dataset_id: str) -> pd.DataFrame:
         """

@@ -10,7 +10,7 @@ import pandas as pd
 from sb3_dce.data.catalog import resolve
 from sb3_dce.experiments.captions import caption, caption_of
 from sb3_dce.experiments.evidence import N_LATE, Evidence, at_end, curve_of, n_diverged_in, of_seeds_that_ended
-from sb3_dce.experiments.grid import Variant, agent_key, settings_in_force, source_of
+from sb3_dce.experiments.grid import Variant, source_of
 from sb3_dce.experiments.paper import MIXED_PROTOCOLS, paper_score, paper_total
 from sb3_dce.experiments.statistics import (
     N_RESAMPLES,
@@ -320,13 +320,12 @@ def seed_table(evidence: Evidence) -> TextTable | None:
     """
     rows, shown = [], []
     for dataset, name in evidence.table_rows():
-        known: set[str] = set()
+        known: set[tuple[str, int]] = set()
         for variant in evidence.variants(dataset):
-            settings = settings_in_force(variant, name, evidence.scale)
             every = evidence.rows_of_any_length(variant, name)
             for length in sorted(every["n_updates"].unique()):
                 runs = every[every["n_updates"] == length]
-                agent = agent_key(variant.algo, settings, int(length)) + str(length)
+                agent = evidence.key_of(variant, name, int(length)), int(length)
                 ends = runs[(runs["metric"] == "score") & (runs["step"] == length) | (runs["metric"] == "diverged")]
                 if agent in known or ends["seed"].nunique() < 2:  # "one setting" is the same agent where it is the row's
                     continue
