@@ -455,8 +455,7 @@ class Evidence:
         if curve.empty or not len(largest) or settings.get("reward_normalization", "none known") is not None:
             return False
         limit = q_limit(settings["reward_scale"] * float(largest.max()) + abs(settings["reward_shift"]), settings["gamma"])
-        last = curve[curve.index > (1.0 - TAIL) * int(rows["n_updates"].iloc[0])]
-        return bool((last.mean().abs() > limit).any())
+        return bool((last_tenth(curve, int(rows["n_updates"].iloc[0])).mean().abs() > limit).any())
 
     def n_diverged(self, variant: Variant, dataset_id: str) -> int:
         """
@@ -508,7 +507,7 @@ class Evidence:
         :param dataset_id: data of its runs
         :return: mean over the last tenth and over seeds; ``None`` without values in it
         """
-        return mean_over_seeds(curve[curve.index > (1.0 - TAIL) * (self.n_updates(dataset_id) or 0)])
+        return mean_over_seeds(last_tenth(curve, self.n_updates(dataset_id) or 0))
 
     # -- theory ----------------------------------------------------------------------------------------------------
 
@@ -606,6 +605,17 @@ def curve_of(rows: pd.DataFrame, metric: str) -> pd.DataFrame:
     """
     rows = rows[(rows["metric"] == metric) & (rows["step"] > 0)]
     return rows.pivot(index="step", columns="seed", values="value").sort_index()
+
+
+def last_tenth(curve: pd.DataFrame, n_updates: int) -> pd.DataFrame:
+    """
+    The part of a curve that stands for what a run has become.
+
+    :param curve: one column per seed, indexed by gradient steps
+    :param n_updates: length of the runs
+    :return: its points in the last tenth; none if the runs ended before
+    """
+    return curve[curve.index > (1.0 - TAIL) * n_updates]
 
 
 def mean_over_seeds(curve: pd.DataFrame) -> float | None:

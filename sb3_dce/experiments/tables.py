@@ -71,6 +71,11 @@ def score_table(evidence: Evidence) -> TextTable:
     return TextTable(header, tuple(rows), f"{caption(evidence, ids)} {BOLD_RULE}{_mark_note(rows)} {tuned} {MIXED_PROTOCOLS}")
 
 
+def _mark(evidence: Evidence, variant: Variant, ids: list[str]) -> str:
+    """Mark behind a number that a run whose critics diverged has a part in."""
+    return f" {MARK}" if any(evidence.overvalues(variant, name) for name in ids) else ""
+
+
 def _mark_note(rows: Sequence[Sequence[str]]) -> str:
     """What the mark says, if it is there."""
     if not any(cell.endswith(MARK) for row in rows for cell in row):
@@ -100,8 +105,7 @@ def _total_rows(evidence: Evidence, methods: list[str]) -> list[tuple[str, ...]]
                 scores = [evidence.last(variant, name) for name in ids]
                 whole = len(ids) == len(wanted) and all(map(len, scores)) and len(lengths) == 1
                 whole = whole and not any(evidence.n_diverged(variant, name) for name in ids)
-                mark = f" {MARK}" if any(evidence.overvalues(variant, name) for name in ids) else ""
-                totals.append(f"{sum(task.mean() for task in scores):.1f}{mark}" if whole else "-")
+                totals.append(f"{sum(task.mean() for task in scores):.1f}{_mark(evidence, variant, ids)}" if whole else "-")
             label = f"total of {len(wanted)} {family} sets, {'D4RL' if source == 'D4RL' else 'our own'}"
             found.append((label, *totals, "", *(paper if source == "D4RL" else ("",) * len(paper))))
     return found
@@ -119,7 +123,7 @@ def score_cell(evidence: Evidence, variant: Variant, dataset_id: str, best: Inte
     :return: mean, deviation, number of seeds if it is not the usual one, and how many diverged; without runs of the row's
         length the same of its longest, marked as such, or "-"
     """
-    mark = f" {MARK}" if evidence.overvalues(variant, dataset_id) else ""
+    mark = _mark(evidence, variant, [dataset_id])
     longest = evidence.of_other_length(variant, dataset_id)
     if len(longest):
         return _cell_of_other_length(longest, usual) + mark
@@ -290,10 +294,9 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
             chance = f"{probability_of_improvement([evidence.last(dce, name) for name in ids], scores):.2f}"
         printed = [None if variant.paper is None else paper_score(name, variant.paper) for name in paper_rows]
         known = [cell.score for cell in printed if cell is not None and cell.score is not None]
-        mark = f" {MARK}" if any(evidence.overvalues(variant, name) for name in ids) else ""
         rows.append(
             (
-                f"{variant.name}{mark}",
+                f"{variant.name}{_mark(evidence, variant, ids)}",
                 *(f"{sums.mean:.1f}", *spreads, f"{mean_of_tasks(scores):.1f}", f"{iqm(scores):.1f}"),
                 f"{low:.1f} to {high:.1f}" if all(len(task) > 1 for task in scores) else "-",
                 chance,

@@ -333,10 +333,8 @@ def _cql_q(evidence: Evidence) -> list[Verdict]:
     rule = f"in-data Q of expectile 0.5 < 0.7 < 0.9 ({TENTH})"
     found = [judge("A higher expectile gives a higher Q (a slacker estimate)", rule, rising(levels), text_of(levels))]
     names = ["expectile 0.7", "without policy"]
-    spreads, q_values = (
-        _second_halves(evidence, names, lambda curve: float(np.std(curve, ddof=1))),
-        values_of(evidence, names, "q_data"),
-    )
+    spreads = _second_halves(evidence, names, lambda curve: float(np.std(curve, ddof=1)))
+    q_values = values_of(evidence, names, "q_data")
     holds: bool | str | None = None
     if len(spreads) == 2 and q_values is not None:
         seen = any(spreads[name] >= LARGE_WAVE * abs(q_values[name]) for name in names)
