@@ -16,7 +16,7 @@ from sb3_dce.experiments.captions import caption
 from sb3_dce.experiments.claims import claim_table, own_table_facts
 from sb3_dce.experiments.curves import panel_curves
 from sb3_dce.experiments.diagnosis import diagnostics_table, variant_table, verdict_of
-from sb3_dce.experiments.equal_steps import equal_steps_table
+from sb3_dce.experiments.equal_steps import equal_steps_table, longer_table
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.figures import draw, draw_profile
 from sb3_dce.experiments.grid import EMBEDDED, experiment_ids, load_experiment, variant_hash
@@ -216,6 +216,28 @@ def test_agents_with_runs_of_several_lengths_have_a_table_of_scores_after_equall
     assert table is not None
     assert [cell(table, "total", column) for column in columns] == ["20,000", "5.5", "15.0", "-", "25.0", "-"]
     assert equal_steps_table(evidence_of(other)) is None, "the table of scores compares them"
+
+
+def test_longer_runs_have_a_table_with_the_mean_of_their_last_evaluations() -> None:
+    def run(agent: str, dataset: str, seed: int, n_updates: int, *course: float) -> pd.DataFrame:
+        return run_rows(TABLE, agent, dataset, seed, curves={"score": course}, n_updates=n_updates)
+
+    usual = [run(agent, CHEETAH, 0, 50_000, 1.0, 2.0) for agent in ("BC", "IQL", "TD3-BC", "DCE")]
+    assert longer_table(evidence_of(results.merge(usual))) is None
+    longer = [run(agent, CHEETAH, seed, 100_000, *range(12)) for agent in ("BC", "DCE") for seed in (0, 1)]
+    longer += [run("DCE", CHEETAH, 0, 200_000, 7.0, 8.0), diverged("IQL", CHEETAH, 0, n_updates=100_000)]
+    table = longer_table(evidence_of(results.merge([*usual, *longer])))
+    assert table is not None
+    shown = [cell(table, CHEETAH, column) for column in ("steps", "BC", "IQL", "DCE", "CQL")]
+    assert shown == ["100,000", "11.0 ± 0.0 (6.5, 2 seeds)", "(1 diverged)", "11.0 ± 0.0 (6.5, 2 seeds)", "-"]
+    assert len(table.rows) == 1, "one set has no total"
+    other = [run(agent, "walker2d-medium-sb3", 0, 100_000, 4.0, 6.0) for agent in ("BC", "IQL")]
+    other += [run("DCE", "walker2d-medium-sb3", 0, 50_000, 4.0, 6.0), run("TD3-BC", "walker2d-medium-sb3", 0, 50_000, 4.0)]
+    other += [run("PBRL", "walker2d-medium-sb3", 0, 50_000, 4.0)]
+    table = longer_table(evidence_of(results.merge([*usual, *longer, *other])))
+    assert table is not None
+    assert cell(table, "walker2d-medium-sb3", "IQL") == "6.0", "two evaluations have no mean of the last ten beside them"
+    assert [cell(table, "total", column) for column in ("steps", "BC", "IQL", "DCE")] == ["100,000", "17.0", "-", "-"]
 
 
 def test_all_columns_of_the_long_table_are_over_the_same_seeds() -> None:

@@ -1,4 +1,4 @@
-"""Scores of all agents after equally many steps, where the slow ones have shorter runs than the others."""
+"""Scores after equally many steps, where slow agents have shorter runs than the row of the table, or some have longer ones."""
 
 from __future__ import annotations
 
@@ -7,15 +7,20 @@ from collections.abc import Mapping
 import numpy as np
 import pandas as pd
 
-from sb3_dce.experiments.captions import caption
-from sb3_dce.experiments.evidence import Evidence, curve_of, n_diverged_in, of_seeds_that_ended
-from sb3_dce.experiments.tables import mean_and_spread, parts_of, rows_of_part
+from sb3_dce.experiments.captions import caption, caption_of
+from sb3_dce.experiments.evidence import N_LATE, Evidence, curve_of, late_mean, n_diverged_in, of_seeds_that_ended
+from sb3_dce.experiments.grid import Variant
+from sb3_dce.experiments.tables import mark, mark_note, mean_and_spread, parts_of, rows_of_part
 from sb3_dce.experiments.text_table import TextTable
 
 NOTE = (
     "The last number of steps after which every agent with runs on a set was evaluated. Longer runs are on their way there: "
     "what an agent plans over a whole run (IQL the learning rate of its actor) is that of the longer one. No claim is judged "
     "by these scores."
+)
+LONGER_NOTE = (
+    "Runs that are longer than those of the table of scores, the commonest such length of each set; in brackets the mean of "
+    f"the last {N_LATE} evaluations."
 )
 
 
@@ -43,14 +48,52 @@ def equal_steps_table(evidence: Evidence) -> TextTable | None:
         at = {agent: curve.loc[after].to_numpy() for agent, curve in curves.items() if len(curve)}
         rows.append((name, f"{after:,}", *(_cell(at.get(v.name), lost.get(v.name, 0)) for v in agents)))
         scores[name] = after, {agent: found for agent, found in at.items() if agent not in lost}
+    rows += _totals(evidence, agents, scores)
+    header = ("data", "steps", *(v.name for v in agents))
+    return TextTable(header, tuple(rows), f"{NOTE} {caption(evidence, scores, agents, 'the policy at the step of the row')}")
+
+
+def longer_table(evidence: Evidence) -> TextTable | None:
+    """
+    What more steps do, where some agents have been trained for longer than the row of the table of scores.
+
+    :param evidence: of an experiment with a table
+    :return: one row per file with such runs, totals as in :func:`equal_steps_table`; ``None`` without any
+    """
+    agents = [v for v in evidence.experiment.variants if v.paper is not None]
+    rows: list[tuple[str, ...]] = []
+    scores: dict[str, tuple[int, dict[str, np.ndarray]]] = {}
+    parts: list[pd.DataFrame] = []
+    for _, name in evidence.table_rows():
+        if (length := evidence.usual_longer_length(name)) is None:
+            continue
+        view = evidence.among([v.name for v in agents], length)
+        late = {v.name: late_mean(view.rows_of(v, name)) for v in agents}
+        lost = {v.name: n for v in agents if (n := view.n_diverged(v, name))}
+        at = {v.name: found for v in agents if len(found := view.last(v, name))}
+        cells = (_cell(at.get(v.name), lost.get(v.name, 0), late[v.name]) + mark(view, v, [name]) for v in agents)
+        rows.append((name, f"{length:,}", *cells))
+        scores[name] = length, {agent: found for agent, found in at.items() if agent not in lost}
+        parts += [view.rows_of(v, name) for v in agents]
+    if not rows:
+        return None
+    rows += _totals(evidence, agents, scores)
+    origin = caption_of(evidence, pd.concat(parts), agents)
+    return TextTable(("data", "steps", *(v.name for v in agents)), tuple(rows), f"{LONGER_NOTE}{mark_note(rows)} {origin}")
+
+
+def _totals(
+    evidence: Evidence, agents: list[Variant], scores: Mapping[str, tuple[int, dict[str, np.ndarray]]]
+) -> list[tuple[str, ...]]:
+    """Sums over the data of a source with scores after the same number of steps on all of them, for agents that have all."""
+    rows: list[tuple[str, ...]] = []
     for part in parts_of(evidence):
         ids = [name for name in rows_of_part(evidence, part) if name in scores]
         steps = {scores[name][0] for name in ids}
         if len(ids) > 1 and len(steps) == 1:
             sums = (_total([scores[name][1] for name in ids], v.name) for v in agents)
             rows.append((f"total of these {len(ids)} ({part.replace('-', ', ')})", f"{steps.pop():,}", *sums))
-    header = ("data", "steps", *(v.name for v in agents))
-    return TextTable(header, tuple(rows), f"{NOTE} {caption(evidence, scores, agents, 'the policy at the step of the row')}")
+    return rows
 
 
 def _curve(rows: pd.DataFrame) -> pd.DataFrame:
@@ -64,8 +107,9 @@ def _last_common_step(curves: Mapping[str, pd.DataFrame]) -> int | None:
     return int(max(common)) if common else None
 
 
-def _cell(scores: np.ndarray | None, n_diverged: int) -> str:
-    notes = [] if scores is None or len(scores) < 2 else [f"{len(scores)} seeds"]
+def _cell(scores: np.ndarray | None, n_diverged: int, late: float | None = None) -> str:
+    notes = [] if late is None else [f"{late:.1f}"]
+    notes += [] if scores is None or len(scores) < 2 else [f"{len(scores)} seeds"]
     notes += [f"{n_diverged} diverged"] if n_diverged else []
     text = "" if scores is None else mean_and_spread(scores)
     return f"{text} ({', '.join(notes)})".strip() if notes else text or "-"

@@ -358,18 +358,26 @@ class Evidence:
         rows = rows[rows["n_updates"] > (self.n_updates(dataset_id) or 0)]
         return rows[rows["n_updates"] == rows["n_updates"].max()]
 
+    def usual_longer_length(self, dataset_id: str) -> int | None:
+        """
+        Length at which agents are compared a second time, after more steps than in the row.
+
+        :param dataset_id: data
+        :return: of the lengths above the row's that which most agents have, the longest of several; ``None`` without such runs
+        """
+        runs = runs_in(self._of_any_length(dataset_id))
+        runs = runs[runs["n_updates"] > (self.n_updates(dataset_id) or 0)]
+        return _usual_length(runs) if len(runs) else None
+
     def late_mean_of_longer(self, variant: Variant, dataset_id: str) -> float | None:
         """
         Mean of the last ten evaluations of the runs of :meth:`last_of_longer`: the last one alone may be a jump.
 
         :param variant: of the experiment
         :param dataset_id: data
-        :return: normalised score, over the seeds that have not diverged; ``None`` without such runs, or if ten evaluations are
-            all they have
+        :return: as :func:`late_mean`
         """
-        rows = self._longest(variant, dataset_id)
-        curve = of_seeds_that_ended(curve_of(rows, "score"), int(rows["n_updates"].max() if len(rows) else 0))
-        return mean_over_seeds(curve.tail(N_LATE)) if len(curve) > N_LATE else None
+        return late_mean(self._longest(variant, dataset_id))
 
     def last_of_most_seeds(self, variant: Variant, dataset_id: str) -> tuple[np.ndarray, int] | None:
         """
@@ -637,6 +645,18 @@ def of_seeds_that_ended(curve: pd.DataFrame, n_updates: int) -> pd.DataFrame:
     :return: columns of the seeds with a value at the end; empty without any
     """
     return curve.loc[:, curve.reindex([n_updates]).notna().iloc[0]].dropna(how="all")
+
+
+def late_mean(rows: pd.DataFrame) -> float | None:
+    """
+    Mean of the last ten evaluations, beside which the last one is seen to be a jump or not.
+
+    :param rows: of runs of one agent and length
+    :return: normalised score, over the seeds that have not diverged; ``None`` without runs, or if ten evaluations are all they
+        have
+    """
+    curve = of_seeds_that_ended(curve_of(rows, "score"), int(rows["n_updates"].max() if len(rows) else 0))
+    return mean_over_seeds(curve.tail(N_LATE)) if len(curve) > N_LATE else None
 
 
 def n_diverged_in(rows: pd.DataFrame) -> int:

@@ -51,7 +51,10 @@ PLAN_KEY = ["dataset", "agent", "config_hash", "n_updates", "seed"]
 # Its runs are too short, or evaluated too little, to say anything about scores.
 TIMING = "run-times"
 # Diagnostics that figures, verdicts and the search for causes read, by their names in the log.
-CURVES = ("q_data", "q_policy", "value", "gap_td", "ent_coef", "beta_eff", "survival_margin", "action_dist", "entropy", "adv")
+CURVES = (
+    *("q_data", "q_policy", "value", "gap_td", "ent_coef", "beta_eff", "survival_margin", "action_dist", "entropy", "adv"),
+    *("mmd", "alpha"),  # UWAC's distance from its model of the data, and the weight it has in the actor's loss
+)
 PROBE_CURVE = re.compile(r"probe\d+_(data|policy|init|best|max|min|rank)")
 DATA_FACTS = ("rows", "reward_mean", "reward_abs_max", "n_terminals")
 # A curve of diagnostics has at most POINTS points, each the mean since the last; a short run has wider gaps than FINEST steps

@@ -68,16 +68,28 @@ def score_table(evidence: Evidence) -> TextTable:
         "DCE has the paper's row of each dataset; the paper tuned these by evaluating online. 'One setting' has its commonest "
         "row everywhere; up to the first change of beta, after 50,000 steps, both are one agent where the row begins alike."
     )
-    return TextTable(header, tuple(rows), f"{caption(evidence, ids)} {BOLD_RULE}{_mark_note(rows)} {tuned} {MIXED_PROTOCOLS}")
+    return TextTable(header, tuple(rows), f"{caption(evidence, ids)} {BOLD_RULE}{mark_note(rows)} {tuned} {MIXED_PROTOCOLS}")
 
 
-def _mark(evidence: Evidence, variant: Variant, ids: list[str]) -> str:
-    """Mark behind a number that a run whose critics diverged has a part in."""
+def mark(evidence: Evidence, variant: Variant, ids: list[str]) -> str:
+    """
+    Mark behind a number that a run whose critics diverged has a part in.
+
+    :param evidence: rows
+    :param variant: agent
+    :param ids: data the number is made of
+    :return: with a space before it; empty if no run of these did
+    """
     return f" {MARK}" if any(evidence.overvalues(variant, name) for name in ids) else ""
 
 
-def _mark_note(rows: Sequence[Sequence[str]]) -> str:
-    """What the mark says, if it is there."""
+def mark_note(rows: Sequence[Sequence[str]]) -> str:
+    """
+    What the mark says, if it is there.
+
+    :param rows: cells of a table
+    :return: a sentence with a space before it; empty if no cell ends with the mark
+    """
     if not any(cell.endswith(MARK) for row in rows for cell in row):
         return ""
     return (
@@ -105,7 +117,7 @@ def _total_rows(evidence: Evidence, methods: list[str]) -> list[tuple[str, ...]]
                 scores = [evidence.last(variant, name) for name in ids]
                 whole = len(ids) == len(wanted) and all(map(len, scores)) and len(lengths) == 1
                 whole = whole and not any(evidence.n_diverged(variant, name) for name in ids)
-                totals.append(f"{sum(task.mean() for task in scores):.1f}{_mark(evidence, variant, ids)}" if whole else "-")
+                totals.append(f"{sum(task.mean() for task in scores):.1f}{mark(evidence, variant, ids)}" if whole else "-")
             label = f"total of {len(wanted)} {family} sets, {'D4RL' if source == 'D4RL' else 'our own'}"
             found.append((label, *totals, "", *(paper if source == "D4RL" else ("",) * len(paper))))
     return found
@@ -123,10 +135,10 @@ def score_cell(evidence: Evidence, variant: Variant, dataset_id: str, best: Inte
     :return: mean, deviation, number of seeds if it is not the usual one, and how many diverged; without runs of the row's
         length the same of its longest, marked as such, or "-"
     """
-    mark = _mark(evidence, variant, [dataset_id])
+    sign = mark(evidence, variant, [dataset_id])
     longest = evidence.of_other_length(variant, dataset_id)
     if len(longest):
-        return _cell_of_other_length(longest, usual) + mark
+        return _cell_of_other_length(longest, usual) + sign
     scores, diverged = evidence.last(variant, dataset_id), evidence.n_diverged(variant, dataset_id)
     lost = f" ({diverged} diverged)" if diverged else ""
     if not len(scores):
@@ -136,7 +148,7 @@ def score_cell(evidence: Evidence, variant: Variant, dataset_id: str, best: Inte
         text = f"**{text}**"
     if len(scores) != usual:
         text += f" ({_seeds(scores)})"
-    return text + lost + mark
+    return text + lost + sign
 
 
 def _cell_of_other_length(rows: pd.DataFrame, usual: int) -> str:
@@ -296,7 +308,7 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
         known = [cell.score for cell in printed if cell is not None and cell.score is not None]
         rows.append(
             (
-                f"{variant.name}{_mark(evidence, variant, ids)}",
+                f"{variant.name}{mark(evidence, variant, ids)}",
                 *(f"{sums.mean:.1f}", *spreads, f"{mean_of_tasks(scores):.1f}", f"{iqm(scores):.1f}"),
                 f"{low:.1f} to {high:.1f}" if all(len(task) > 1 for task in scores) else "-",
                 chance,
@@ -309,7 +321,7 @@ def _aggregate_table(evidence: Evidence, ids: list[str]) -> TextTable:
         "half of the data are left out. An agent that diverged on a seed has no total. IQM is the mean of the middle half of "
         "all scores, P(DCE > agent) the share of pairs of runs on the same data in which DCE scores more. Each data set has "
         f"the same weight. The interval is a stratified bootstrap over seeds within data sets ({N_RESAMPLES:,} resamples; "
-        f"none with one seed); the deviation of the total takes the rows as independent.{_mark_note(rows)} {MIXED_PROTOCOLS}"
+        f"none with one seed); the deviation of the total takes the rows as independent.{mark_note(rows)} {MIXED_PROTOCOLS}"
     )
     return TextTable(header, tuple(rows), f"{caption(evidence, ids, variants)} {note}")
 
