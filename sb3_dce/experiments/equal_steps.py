@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_dce.experiments.captions import caption, caption_of
-from sb3_dce.experiments.evidence import N_LATE, Evidence, curve_of, late_mean, n_diverged_in, of_seeds_that_ended
+from sb3_dce.experiments.evidence import N_LATE, Evidence, ended_scores, late_mean, n_diverged_in
 from sb3_dce.experiments.grid import Variant
 from sb3_dce.experiments.tables import mark, mark_note, mean_and_spread, parts_of, rows_of_part
 from sb3_dce.experiments.text_table import TextTable
@@ -41,7 +41,7 @@ def equal_steps_table(evidence: Evidence) -> TextTable | None:
     for name in ids:
         runs = {v.name: evidence.shown([name], [v]) for v in agents}
         lost = {agent: n for agent, found in runs.items() if (n := n_diverged_in(found))}
-        curves = {agent: _curve(found) for agent, found in runs.items()}
+        curves = {agent: ended_scores(found) for agent, found in runs.items()}
         after = _last_common_step(curves)
         if after is None:
             continue
@@ -94,11 +94,6 @@ def _totals(
             sums = (_total([scores[name][1] for name in ids], v.name) for v in agents)
             rows.append((f"total of these {len(ids)} ({part.replace('-', ', ')})", f"{steps.pop():,}", *sums))
     return rows
-
-
-def _curve(rows: pd.DataFrame) -> pd.DataFrame:
-    """Scores of the seeds that did not diverge, empty without any."""
-    return of_seeds_that_ended(curve_of(rows, "score"), int(rows["n_updates"].iloc[0])) if len(rows) else pd.DataFrame()
 
 
 def _last_common_step(curves: Mapping[str, pd.DataFrame]) -> int | None:

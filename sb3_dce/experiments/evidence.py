@@ -647,6 +647,16 @@ def of_seeds_that_ended(curve: pd.DataFrame, n_updates: int) -> pd.DataFrame:
     return curve.loc[:, curve.reindex([n_updates]).notna().iloc[0]].dropna(how="all")
 
 
+def ended_scores(rows: pd.DataFrame) -> pd.DataFrame:
+    """
+    Course of the score of the seeds that did not diverge.
+
+    :param rows: of runs of one agent and length
+    :return: one column per seed, indexed by gradient steps; empty without any
+    """
+    return of_seeds_that_ended(curve_of(rows, "score"), int(rows["n_updates"].max() if len(rows) else 0))
+
+
 def late_mean(rows: pd.DataFrame) -> float | None:
     """
     Mean of the last ten evaluations, beside which the last one is seen to be a jump or not.
@@ -655,7 +665,7 @@ def late_mean(rows: pd.DataFrame) -> float | None:
     :return: normalised score, over the seeds that have not diverged; ``None`` without runs, or if ten evaluations are all they
         have
     """
-    curve = of_seeds_that_ended(curve_of(rows, "score"), int(rows["n_updates"].max() if len(rows) else 0))
+    curve = ended_scores(rows)
     return mean_over_seeds(curve.tail(N_LATE)) if len(curve) > N_LATE else None
 
 

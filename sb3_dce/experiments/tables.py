@@ -9,7 +9,7 @@ import pandas as pd
 
 from sb3_dce.data.catalog import resolve
 from sb3_dce.experiments.captions import caption, caption_of
-from sb3_dce.experiments.evidence import N_LATE, Evidence, at_end, curve_of, n_diverged_in, of_seeds_that_ended
+from sb3_dce.experiments.evidence import N_LATE, Evidence, at_end, ended_scores, n_diverged_in
 from sb3_dce.experiments.grid import Variant, source_of
 from sb3_dce.experiments.paper import MIXED_PROTOCOLS, paper_score, paper_total
 from sb3_dce.experiments.statistics import (
@@ -381,7 +381,7 @@ def long_table(evidence: Evidence) -> TextTable:
             if len(scores):
                 low, high = mean_interval(scores) if len(scores) > 1 else (float("nan"), float("nan"))
                 few = at_end(runs, "score_paper_episodes")
-                curve = of_seeds_that_ended(curve_of(runs, "score"), int(runs["n_updates"].iloc[0]))
+                curve = ended_scores(runs)
                 paper_mode = float(few.mean()) if len(few) else float("nan")
                 last_ten = float(curve.tail(N_LATE).mean().mean()) if len(curve) >= N_LATE else float("nan")
                 late = (last_ten, float(curve.max().mean()))
