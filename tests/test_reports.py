@@ -16,7 +16,7 @@ from sb3_dce.experiments.captions import caption
 from sb3_dce.experiments.claims import claim_table, own_table_facts
 from sb3_dce.experiments.curves import panel_curves
 from sb3_dce.experiments.diagnosis import diagnostics_table, variant_table, verdict_of
-from sb3_dce.experiments.equal_steps import equal_steps_table, longer_table
+from sb3_dce.experiments.equal_steps import equal_steps_table, other_length_table
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.figures import draw, draw_profile
 from sb3_dce.experiments.grid import EMBEDDED, experiment_ids, load_experiment, variant_hash
@@ -126,12 +126,24 @@ def test_two_versions_of_a_file_are_not_mixed() -> None:
     assert evidence.left_out == 1
 
 
-def test_a_row_has_one_length_the_one_most_agents_have() -> None:
-    long = table_rows(TABLE, {"walker2d-medium-sb3": scores()}, n_updates=2000)
-    short = table_rows(TABLE, {"walker2d-medium-sb3": {"DCE": [1.0]}}, n_updates=1000)
-    rows = results.merge([long, short])
-    assert evidence_of(rows).last(TABLE.variant("DCE"), "walker2d-medium-sb3").tolist() == [40.0, 42.0, 44.0]
-    assert evidence_of(rows, n_updates=1000).last(TABLE.variant("DCE"), "walker2d-medium-sb3").tolist() == [1.0]
+def test_a_row_has_one_length_the_longest_that_more_than_half_of_the_papers_agents_have() -> None:
+    walker = "walker2d-medium-sb3"
+
+    def length(longer: tuple[str, ...], **of: object) -> int | None:
+        short = table_rows(TABLE, {walker: {name: [1.0] for name in AGENTS}}, n_updates=1000)
+        long = table_rows(TABLE, {walker: {name: [2.0] for name in longer}}, n_updates=2000)
+        return evidence_of(results.merge([short, long]), **of).n_updates(walker)  # type: ignore[arg-type]
+
+    assert [v.name for v in TABLE.variants if v.paper is None] == ["DCE one setting"], "counted by the paper's seven agents"
+    assert length(("BC", "IQL", "DCE", "DCE one setting")) == 1000
+    assert length(("BC", "IQL", "TD3-BC", "DCE")) == 2000
+    assert length(("BC", "IQL", "TD3-BC", "DCE"), n_updates=1000) == 1000, "the caller's"
+
+
+def test_a_row_without_a_length_of_most_agents_has_the_commonest() -> None:
+    parts = [("BC", 1000), ("IQL", 1000), ("DCE", 2000), ("CQL", 3000), ("PBRL", 4000)]
+    rows = [table_rows(TABLE, {CHEETAH: {name: [1.0]}}, n_updates=n_updates) for name, n_updates in parts]
+    assert evidence_of(results.merge(rows)).n_updates(CHEETAH) == 1000
 
 
 def test_totals_are_of_data_of_one_length() -> None:
@@ -218,23 +230,41 @@ def test_agents_with_runs_of_several_lengths_have_a_table_of_scores_after_equall
     assert equal_steps_table(evidence_of(other)) is None, "the table of scores compares them"
 
 
-def test_longer_runs_have_a_table_with_the_mean_of_their_last_evaluations() -> None:
+def test_scores_after_equally_many_steps_are_of_the_runs_with_the_most_seeds() -> None:
+    def curve(agent: str, seed: int, n_updates: int, level: float) -> pd.DataFrame:
+        course = [level + step for step in range(n_updates // 10_000)]
+        return run_rows(TABLE, agent, CHEETAH, seed, curves={"score": course}, n_updates=n_updates)
+
+    runs = [curve("PBRL", 0, 20_000, 80.0)]
+    for agent in ("BC", "IQL", "TD3-BC", "DCE"):
+        runs += [curve(agent, seed, 50_000, 10.0 * seed) for seed in range(3 if agent == "DCE" else 1)]
+        runs += [curve(agent, 0, 200_000, 50.0), *(curve(agent, seed, 10_000, 90.0) for seed in range(5))]
+    evidence = evidence_of(results.merge(runs))
+    assert evidence.n_updates(CHEETAH) == 200_000
+    table = equal_steps_table(evidence)
+    assert table is not None and "Gradient steps: 20,000 to 50,000; seeds: 1 to 3" in table.caption
+    shown = [cell(table, CHEETAH, column) for column in ("steps", "BC", "PBRL", "DCE")]
+    assert shown == ["20,000", "1.0", "81.0", "11.0 ± 10.0 (3 seeds)"], "those of 10,000 steps are too short"
+
+
+def test_runs_of_another_length_have_a_table_with_the_mean_of_their_last_evaluations() -> None:
     def run(agent: str, dataset: str, seed: int, n_updates: int, *course: float) -> pd.DataFrame:
         return run_rows(TABLE, agent, dataset, seed, curves={"score": course}, n_updates=n_updates)
 
-    usual = [run(agent, CHEETAH, 0, 50_000, 1.0, 2.0) for agent in ("BC", "IQL", "TD3-BC", "DCE")]
-    assert longer_table(evidence_of(results.merge(usual))) is None
+    usual = [run(agent, CHEETAH, 0, 50_000, 1.0, 2.0) for agent in ("BC", "UWAC", "IQL", "TD3-BC", "CQL", "DCE")]
+    assert other_length_table(evidence_of(results.merge(usual))) is None
+    slow = run("PBRL", CHEETAH, 0, 20_000, 1.0)
+    assert other_length_table(evidence_of(results.merge([*usual, slow]))) is None, "it stands in the table of scores"
     longer = [run(agent, CHEETAH, seed, 100_000, *range(12)) for agent in ("BC", "DCE") for seed in (0, 1)]
     longer += [run("DCE", CHEETAH, 0, 200_000, 7.0, 8.0), diverged("IQL", CHEETAH, 0, n_updates=100_000)]
-    table = longer_table(evidence_of(results.merge([*usual, *longer])))
+    table = other_length_table(evidence_of(results.merge([*usual, slow, *longer])))
     assert table is not None
     shown = [cell(table, CHEETAH, column) for column in ("steps", "BC", "IQL", "DCE", "CQL")]
     assert shown == ["100,000", "11.0 ± 0.0 (6.5, 2 seeds)", "(1 diverged)", "11.0 ± 0.0 (6.5, 2 seeds)", "-"]
     assert len(table.rows) == 1, "one set has no total"
-    other = [run(agent, "walker2d-medium-sb3", 0, 100_000, 4.0, 6.0) for agent in ("BC", "IQL")]
-    other += [run("DCE", "walker2d-medium-sb3", 0, 50_000, 4.0, 6.0), run("TD3-BC", "walker2d-medium-sb3", 0, 50_000, 4.0)]
-    other += [run("PBRL", "walker2d-medium-sb3", 0, 50_000, 4.0)]
-    table = longer_table(evidence_of(results.merge([*usual, *longer, *other])))
+    other = [run(agent, "walker2d-medium-sb3", 0, 200_000, 4.0, 7.0) for agent in ("BC", "IQL", "DCE")]
+    other += [run(agent, "walker2d-medium-sb3", 0, 100_000, 4.0, 6.0) for agent in ("BC", "IQL")]
+    table = other_length_table(evidence_of(results.merge([*usual, *longer, *other])))
     assert table is not None
     assert cell(table, "walker2d-medium-sb3", "IQL") == "6.0", "two evaluations have no mean of the last ten beside them"
     assert [cell(table, "total", column) for column in ("steps", "BC", "IQL", "DCE")] == ["100,000", "17.0", "-", "-"]
@@ -559,6 +589,17 @@ def test_claims_on_places_need_all_the_papers_agents_at_one_length() -> None:
     assert verdict.outcome == UNTESTED and "without runs of this length: PBRL" in verdict.numbers
     parts = [table_rows(TABLE, {n: scores(DCE=[90.0])}, n_updates=LONG * (i + 1)) for i, n in enumerate(HALFCHEETAHS)]
     assert claim_of(results.merge(parts), "C4").outcome == UNTESTED
+
+
+def test_claims_on_places_are_about_the_longer_runs_of_most_agents() -> None:
+    columns = scores(IQL=[90.0, 91.0, 92.0])
+    slow = ("UWAC", "PBRL", "CQL")
+    long = table_rows(TABLE, {n: {k: v for k, v in columns.items() if k not in slow} for n in HALFCHEETAHS}, n_updates=200_000)
+    short = table_rows(TABLE, dict.fromkeys(HALFCHEETAHS, columns), n_updates=50_000)
+    assert claim_of(short, "C4").outcome == UNTESTED, "before the first change of beta"
+    verdict = claim_of(results.merge([long, short]), "C4")
+    assert verdict.outcome == NOT_HELD and "2 of 4 (200,000 steps" in verdict.numbers
+    assert "without runs of this length: CQL on 4 of 4 sets" in verdict.numbers
 
 
 @pytest.mark.parametrize(

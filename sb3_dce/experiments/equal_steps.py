@@ -1,4 +1,4 @@
-"""Scores after equally many steps, where slow agents have shorter runs than the row of the table, or some have longer ones."""
+"""Scores after equally many steps, where slow agents have shorter runs than the row of the table, and after another number."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from collections.abc import Mapping
 import numpy as np
 import pandas as pd
 
-from sb3_dce.experiments.captions import caption, caption_of
+from sb3_dce.experiments.captions import caption_of
 from sb3_dce.experiments.evidence import N_LATE, Evidence, ended_scores, late_mean, n_diverged_in
 from sb3_dce.experiments.grid import Variant
 from sb3_dce.experiments.tables import mark, mark_note, mean_and_spread, parts_of, rows_of_part
 from sb3_dce.experiments.text_table import TextTable
 
 NOTE = (
-    "The last number of steps after which every agent with runs on a set was evaluated. Longer runs are on their way there: "
-    "what an agent plans over a whole run (IQL the learning rate of its actor) is that of the longer one. No claim is judged "
-    "by these scores."
+    "The last number of steps after which every agent with runs on a set was evaluated, by its runs with the most seeds, of "
+    "several the shortest. Longer runs are on their way there: what an agent plans over a whole run (IQL the learning rate of "
+    "its actor) is that of the longer one. No claim is judged by these scores."
 )
-LONGER_NOTE = (
-    "Runs that are longer than those of the table of scores, the commonest such length of each set; in brackets the mean of "
-    f"the last {N_LATE} evaluations."
+OTHER_NOTE = (
+    "What more or fewer steps do: further runs of the agents of the table of scores, of the commonest other length of each "
+    f"set; in brackets the mean of the last {N_LATE} evaluations, where there were more. No claim is judged by these scores."
 )
 
 
@@ -38,8 +38,9 @@ def equal_steps_table(evidence: Evidence) -> TextTable | None:
         return None
     rows: list[tuple[str, ...]] = []
     scores: dict[str, tuple[int, dict[str, np.ndarray]]] = {}
+    parts: list[pd.DataFrame] = []
     for name in ids:
-        runs = {v.name: evidence.shown([name], [v]) for v in agents}
+        runs = _runs_to_compare({v.name: evidence.rows_of_any_length(v, name) for v in agents})
         lost = {agent: n for agent, found in runs.items() if (n := n_diverged_in(found))}
         curves = {agent: ended_scores(found) for agent, found in runs.items()}
         after = _last_common_step(curves)
@@ -48,14 +49,32 @@ def equal_steps_table(evidence: Evidence) -> TextTable | None:
         at = {agent: curve.loc[after].to_numpy() for agent, curve in curves.items() if len(curve)}
         rows.append((name, f"{after:,}", *(_cell(at.get(v.name), lost.get(v.name, 0)) for v in agents)))
         scores[name] = after, {agent: found for agent, found in at.items() if agent not in lost}
+        parts += [runs[agent] for agent in at]
+    if not rows:
+        return None
     rows += _totals(evidence, agents, scores)
     header = ("data", "steps", *(v.name for v in agents))
-    return TextTable(header, tuple(rows), f"{NOTE} {caption(evidence, scores, agents, 'the policy at the step of the row')}")
+    origin = caption_of(evidence, pd.concat(parts), agents, "the policy at the step of the row")
+    return TextTable(header, tuple(rows), f"{NOTE} {origin}")
 
 
-def longer_table(evidence: Evidence) -> TextTable | None:
+def _runs_to_compare(every: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
     """
-    What more steps do, where some agents have been trained for longer than the row of the table of scores.
+    Of each agent the runs with the most seeds, of several lengths the shortest; none shorter than the shortest of the longest
+    runs of all agents, which would cut the common step.
+    """
+    shortest = min((rows["n_updates"].max() for rows in every.values() if len(rows)), default=0)
+    found = {}
+    for agent, rows in every.items():
+        lengths = rows[rows["n_updates"] >= shortest].groupby("n_updates")["seed"].nunique()
+        chosen = max(lengths.index, key=lambda n: (lengths[n], -n), default=None)
+        found[agent] = rows[rows["n_updates"] == chosen]
+    return found
+
+
+def other_length_table(evidence: Evidence) -> TextTable | None:
+    """
+    What more or fewer steps do, where agents have been trained for another time than in the row of the table of scores, too.
 
     :param evidence: of an experiment with a table
     :return: one row per file with such runs, totals as in :func:`equal_steps_table`; ``None`` without any
@@ -65,7 +84,7 @@ def longer_table(evidence: Evidence) -> TextTable | None:
     scores: dict[str, tuple[int, dict[str, np.ndarray]]] = {}
     parts: list[pd.DataFrame] = []
     for _, name in evidence.table_rows():
-        if (length := evidence.usual_longer_length(name)) is None:
+        if (length := evidence.usual_other_length(name)) is None:
             continue
         view = evidence.among([v.name for v in agents], length)
         late = {v.name: late_mean(view.rows_of(v, name)) for v in agents}
@@ -79,7 +98,7 @@ def longer_table(evidence: Evidence) -> TextTable | None:
         return None
     rows += _totals(evidence, agents, scores)
     origin = caption_of(evidence, pd.concat(parts), agents)
-    return TextTable(("data", "steps", *(v.name for v in agents)), tuple(rows), f"{LONGER_NOTE}{mark_note(rows)} {origin}")
+    return TextTable(("data", "steps", *(v.name for v in agents)), tuple(rows), f"{OTHER_NOTE}{mark_note(rows)} {origin}")
 
 
 def _totals(

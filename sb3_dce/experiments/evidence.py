@@ -2,8 +2,9 @@
 What the rows say about an experiment: scores of a table's cells, curves of a figure's lines, and where they come from.
 
 All cells of a table row come from one file: where rows of two versions of a dataset are known, those of the file that is here
-are taken, else of the one with more runs, and the others are counted as left out. All have one length; runs of an agent that
-has only others are shown as what they are (:meth:`Evidence.of_other_length`) and take part in no comparison. A panel and a
+are taken, else of the one with more runs, and the others are counted as left out. All have one length
+(:meth:`Evidence.n_updates`); runs of an agent that has only others are shown as what they are
+(:meth:`Evidence.of_other_length`) and take part in no comparison. A panel and a
 claim about some of the variants have the length that these have (:meth:`Evidence.among`). A configuration without runs is
 shown with those of another that is the same agent over their length: two schedules of beta part later.
 """
@@ -48,8 +49,7 @@ class Evidence:
     :param experiment: with its datasets and variants
     :param rows: any rows; those of other experiments count where the run is the same
     :param scale: may change settings of agents, and so decides which configurations are shown
-    :param n_updates: only runs of this length; ``None`` takes for each dataset the length most of its variants have, the
-        longest of these
+    :param n_updates: only runs of this length; ``None`` takes for each dataset that of :meth:`n_updates`
     :param hash_here: gives the SHA-256 of a dataset's file on this machine, ``None`` without one
     :param whole: evidence that this one is a part of, see :meth:`among`
     """
@@ -249,7 +249,11 @@ class Evidence:
 
     def n_updates(self, dataset_id: str) -> int | None:
         """
-        Length of the runs that count on these data: that asked for, else that of most agents, the longest of several.
+        Length of the runs that count on these data: that asked for; else, in a table, the longest that more than half of the
+        paper's agents with runs there have; else that of most variants, the longest of several.
+
+        A row of a table thus moves on to longer runs before the slowest agents have them, as the paper's runs are far longer
+        than any of ours; a figure keeps all its lines.
 
         :param dataset_id: data
         :return: gradient steps; ``None`` without runs of it
@@ -258,8 +262,17 @@ class Evidence:
             runs = runs_in(self._of_any_length(dataset_id))
             if self._n_updates is not None:
                 runs = runs[runs["n_updates"] == self._n_updates]
-            self._length_of[dataset_id] = _usual_length(runs) if len(runs) else None
+            papers = self._of_the_papers_agents(dataset_id, runs) if self.experiment.report == "table" else runs.iloc[:0]
+            longest = _longest_of_most(papers)
+            self._length_of[dataset_id] = longest or (_usual_length(runs) if len(runs) else None)
         return self._length_of[dataset_id]
+
+    def _of_the_papers_agents(self, dataset_id: str, runs: pd.DataFrame) -> pd.DataFrame:
+        """Those of the runs that belong to a column of the paper's tables; further forms of an agent have none."""
+        agents = [v for v in self.experiment.variants if v.paper is not None]
+        keys = {(v.algo, variant_hash(v, dataset_id, self.scale)) for v in agents}
+        is_one = (key in keys for key in zip(runs["agent"], runs["config_hash"], strict=True))
+        return runs[np.fromiter(is_one, dtype=bool, count=len(runs))]
 
     def _rows_of_the_same_agent(self, variant: Variant, dataset_id: str) -> list[pd.DataFrame]:
         """
@@ -358,16 +371,18 @@ class Evidence:
         rows = rows[rows["n_updates"] > (self.n_updates(dataset_id) or 0)]
         return rows[rows["n_updates"] == rows["n_updates"].max()]
 
-    def usual_longer_length(self, dataset_id: str) -> int | None:
+    def usual_other_length(self, dataset_id: str) -> int | None:
         """
-        Length at which agents are compared a second time, after more steps than in the row.
+        Length at which the paper's agents of a row are shown a second time, after more or fewer steps.
 
         :param dataset_id: data
-        :return: of the lengths above the row's that which most agents have, the longest of several; ``None`` without such runs
+        :return: of the lengths but the row's that which most of them have, the longest of several; ``None`` without such runs
         """
-        runs = runs_in(self._of_any_length(dataset_id))
-        runs = runs[runs["n_updates"] > (self.n_updates(dataset_id) or 0)]
-        return _usual_length(runs) if len(runs) else None
+        runs = self._of_the_papers_agents(dataset_id, runs_in(self._of_any_length(dataset_id)))
+        is_of_row = runs["n_updates"] == self.n_updates(dataset_id)
+        agents = set(runs[is_of_row]["config_hash"])
+        others = runs[~is_of_row & runs["config_hash"].isin(agents)]
+        return _usual_length(others) if len(others) else None
 
     def late_mean_of_longer(self, variant: Variant, dataset_id: str) -> float | None:
         """
@@ -679,10 +694,20 @@ def n_diverged_in(rows: pd.DataFrame) -> int:
     return int((rows["metric"] == "diverged").sum())
 
 
+def _n_agents_by_length(runs: pd.DataFrame) -> pd.Series:
+    return runs.drop_duplicates(["dataset", "agent", "config_hash", "n_updates"])["n_updates"].value_counts()
+
+
 def _usual_length(runs: pd.DataFrame) -> int:
     """The length that most agents have, the longest of several."""
-    counts = runs.drop_duplicates(["dataset", "agent", "config_hash", "n_updates"])["n_updates"].value_counts()
+    counts = _n_agents_by_length(runs)
     return int(max(counts.index, key=lambda n: (counts[n], n)))
+
+
+def _longest_of_most(runs: pd.DataFrame) -> int | None:
+    """The longest length that more than half of the agents have; ``None`` if there is none."""
+    counts, n_agents = _n_agents_by_length(runs), len(runs.drop_duplicates(["agent", "config_hash"]))
+    return max((int(n) for n, count in counts.items() if 2 * count > n_agents), default=None)
 
 
 def _scores_and_length(rows: pd.DataFrame) -> tuple[np.ndarray, int] | None:

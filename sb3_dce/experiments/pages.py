@@ -24,7 +24,7 @@ HEADINGS = {
         for source, whose in (("D4RL", "D4RL's"), ("sb3", "our own"))
         for ending, where in (("", ""), ("-adroit", ": Adroit"), ("-kitchen", ": Kitchen"))
     },
-    "longer": "After more steps",
+    "other-length": "After more or fewer steps",
     "equal-steps": "After equally many steps",
     "seeds": "Seed by seed",
     "run-times": "Run times",

@@ -12,7 +12,7 @@ from sb3_dce.dce import OfflineDCE
 from sb3_dce.experiments import diagnosis, tables
 from sb3_dce.experiments.captions import caption_of
 from sb3_dce.experiments.curves import panel_curves, variants_of, view_of
-from sb3_dce.experiments.equal_steps import equal_steps_table, longer_table
+from sb3_dce.experiments.equal_steps import equal_steps_table, other_length_table
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import Variant, source_of
 from sb3_dce.experiments.judging import CLOSE, HELD, NOT_HELD, UNTESTED, Verdict, judge
@@ -68,8 +68,8 @@ def make_report(evidence: Evidence) -> Report:
     judged = verdicts(evidence)
     if kind == "table":
         found["scores"] = tables.score_table(evidence)
-        if (longer := longer_table(evidence)) is not None:
-            found["longer"] = longer
+        if (other := other_length_table(evidence)) is not None:
+            found["other-length"] = other
         if (equal := equal_steps_table(evidence)) is not None:
             found["equal-steps"] = equal
         if (seeds := tables.seed_table(evidence)) is not None:
