@@ -707,7 +707,7 @@ def _usual_length(runs: pd.DataFrame) -> int:
 def _longest_of_most(runs: pd.DataFrame) -> int | None:
     """The longest length that more than half of the agents have; ``None`` if there is none."""
     counts, n_agents = _n_agents_by_length(runs), len(runs.drop_duplicates(["agent", "config_hash"]))
-    return max((int(n) for n, count in counts.items() if 2 * count > n_agents), default=None)
+    return max((int(n) for n in counts.index[2 * counts > n_agents]), default=None)
 
 
 def _scores_and_length(rows: pd.DataFrame) -> tuple[np.ndarray, int] | None:
