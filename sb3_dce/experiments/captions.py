@@ -7,8 +7,9 @@ from typing import Any
 
 import pandas as pd
 
-from sb3_dce.experiments.evidence import Evidence, runs_in, span
+from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import Scale, Variant, source_of
+from sb3_dce.experiments.readings import runs_in, span
 
 LAST_POLICY = "last policy"
 

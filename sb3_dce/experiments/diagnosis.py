@@ -10,9 +10,10 @@ import numpy as np
 import pandas as pd
 
 from sb3_dce.experiments.captions import caption_of
-from sb3_dce.experiments.evidence import Evidence, mean_over_seeds
+from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import Variant
 from sb3_dce.experiments.judging import CLEARLY, CLOSE, GAP, Uncertainty, differs, uncertainty
+from sb3_dce.experiments.readings import mean_over_seeds
 from sb3_dce.experiments.text_table import TextTable
 
 # A change counts as a cause if it closes this share of the distance to the better of BC and IQL.

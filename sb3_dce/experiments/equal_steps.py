@@ -8,8 +8,9 @@ import numpy as np
 import pandas as pd
 
 from sb3_dce.experiments.captions import caption_of
-from sb3_dce.experiments.evidence import N_LATE, Evidence, ended_scores, late_mean, n_diverged_in
+from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import Variant
+from sb3_dce.experiments.readings import N_LATE, ended_scores, late_mean, n_diverged_in
 from sb3_dce.experiments.tables import mark, mark_note, mean_and_spread, parts_of, rows_of_part
 from sb3_dce.experiments.text_table import TextTable
 

@@ -10,8 +10,9 @@ import pandas as pd
 
 from sb3_dce.errors import ConfigError
 from sb3_dce.experiments.claims import claim_table, own_table_facts
-from sb3_dce.experiments.evidence import Evidence, runs_in
+from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.judging import CLEARLY, Verdict
+from sb3_dce.experiments.readings import runs_in
 from sb3_dce.experiments.reports import Report, count
 from sb3_dce.experiments.tables import parts_of
 from sb3_dce.experiments.text_table import TextTable

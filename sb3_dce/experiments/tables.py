@@ -9,9 +9,10 @@ import pandas as pd
 
 from sb3_dce.data.catalog import resolve
 from sb3_dce.experiments.captions import caption, caption_of
-from sb3_dce.experiments.evidence import N_LATE, Evidence, at_end, ended_scores, n_diverged_in
+from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import Variant, source_of
 from sb3_dce.experiments.paper import MIXED_PROTOCOLS, paper_score, paper_total
+from sb3_dce.experiments.readings import N_LATE, at_end, ended_scores, n_diverged_in
 from sb3_dce.experiments.statistics import (
     N_RESAMPLES,
     Interval,

@@ -16,7 +16,7 @@ from sb3_dce.configuration import row_of
 from sb3_dce.dce_probe import PROBE_BETAS
 from sb3_dce.execution import UPDATES_WORTH_COMPILING
 from sb3_dce.experiments.curves import probe_curve, view_of
-from sb3_dce.experiments.evidence import GAMMA, TAU, Evidence, mean_over_seeds, of_seeds_that_ended
+from sb3_dce.experiments.evidence import GAMMA, TAU, Evidence
 from sb3_dce.experiments.grid import source_of
 from sb3_dce.experiments.judging import (
     CLOSE,
@@ -44,6 +44,7 @@ from sb3_dce.experiments.judging import (
 )
 from sb3_dce.experiments.leading import leading
 from sb3_dce.experiments.paper import PAPER_SEEDS
+from sb3_dce.experiments.readings import mean_over_seeds, of_seeds_that_ended
 from sb3_dce.experiments.run_times import fastest_runs
 from sb3_dce.experiments.statistics import sample_std
 from sb3_dce.student import student_quantile
