@@ -17,7 +17,6 @@ from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-import numpy as np
 import pandas as pd
 
 from sb3_dce import configuration
@@ -252,9 +251,7 @@ class Selection:
     def _of_the_papers_agents(self, dataset_id: str, runs: pd.DataFrame) -> pd.DataFrame:
         """Those of the runs that belong to a column of the paper's tables; further forms of an agent have none."""
         agents = [v for v in self.experiment.variants if v.paper is not None]
-        keys = {(v.algo, variant_hash(v, dataset_id, self.scale)) for v in agents}
-        is_one = (key in keys for key in zip(runs["agent"], runs["config_hash"], strict=True))
-        return runs[np.fromiter(is_one, dtype=bool, count=len(runs))]
+        return runs[runs["config_hash"].isin([variant_hash(v, dataset_id, self.scale) for v in agents])]
 
     def usual_other_length(self, dataset_id: str) -> int | None:
         """
