@@ -146,6 +146,14 @@ def test_a_row_without_a_length_of_most_agents_has_the_commonest() -> None:
     assert evidence_of(results.merge(rows)).n_updates(CHEETAH) == 1000
 
 
+def test_scores_are_of_the_rows_length_or_of_the_callers() -> None:
+    long = table_rows(TABLE, {"walker2d-medium-sb3": scores()}, n_updates=2000)
+    short = table_rows(TABLE, {"walker2d-medium-sb3": {"DCE": [1.0]}}, n_updates=1000)
+    rows = results.merge([long, short])
+    assert evidence_of(rows).last(TABLE.variant("DCE"), "walker2d-medium-sb3").tolist() == [40.0, 42.0, 44.0]
+    assert evidence_of(rows, n_updates=1000).last(TABLE.variant("DCE"), "walker2d-medium-sb3").tolist() == [1.0]
+
+
 def test_totals_are_of_data_of_one_length() -> None:
     parts = [
         table_rows(TABLE, {name: scores()}, n_updates=n_updates)
