@@ -219,7 +219,12 @@ def test_run_with_two_sets_of_hyperparameters_is_refused(made_up: pd.DataFrame) 
         results.check_rows(made_up, "rows")
 
 
-@pytest.mark.parametrize("content", [b"not compressed", gzip.compress(b"a,b\n1,2\n"), gzip.compress(b"x" * 1000)[:40], b""])
+# named: gzip writes the time of day, and test processes that start in different seconds must agree on the names of tests
+@pytest.mark.parametrize(
+    "content",
+    [b"not compressed", gzip.compress(b"a,b\n1,2\n"), gzip.compress(b"x" * 1000)[:40], b""],
+    ids=["not gzip", "other columns", "cut off", "empty"],
+)
 def test_damaged_file_is_refused_by_name(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "table1.csv.gz"
     path.write_bytes(content)
