@@ -479,6 +479,15 @@ def test_captions_name_data_hash_length_seeds_and_code() -> None:
     assert f"`hopper-medium-v2` {SHA[:8]}…, of D4RL" in d4rl
 
 
+def test_further_runs_of_several_files_stand_together_by_their_length() -> None:
+    ids = [CHEETAH, "hopper-medium-sb3"]
+    shown = [table_rows(TABLE, {name: scores()}) for name in ids]
+    further = [table_rows(TABLE, {name: {"BC": [1.0]}}, n_updates=200) for name in ids]
+    once = [table_rows(TABLE, {CHEETAH: {"BC": [1.0, 2.0]}}, n_updates=3000)]
+    text = caption(evidence_of(results.merge([*shown, *further, *once])), ids)
+    assert text.endswith(f"Further runs, of other lengths: 2 of 200 steps on 2 data sets; 2 of 3,000 steps on {CHEETAH}.")
+
+
 def test_a_panel_is_as_long_as_its_own_lines(tmp_path: Path) -> None:
     experiment = load_experiment("fig-beta")
     long = [run_rows(experiment, f"beta {b}", CHEETAH, 0, curves={"q_data": [1.0] * 4}, n_updates=200) for b in (0, 2, 4, 8)]

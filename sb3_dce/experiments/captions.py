@@ -95,11 +95,17 @@ def _settings(settings: dict[str, Any]) -> str:
 
 
 def _further(evidence: Evidence, runs: pd.DataFrame, variants: list[Variant]) -> list[str]:
-    """Runs of these agents on the files shown that are not among those shown."""
-    found, here = [], set(runs.itertuples(index=False, name=None))
+    """Runs of these agents on the files shown that are not among those shown, one entry per length."""
+    found: dict[int, dict[str, int]] = {}
+    here = set(runs.itertuples(index=False, name=None))
     for name, sha in runs[["dataset", "dataset_sha256"]].drop_duplicates().itertuples(index=False, name=None):
         of = evidence.every_run(name, variants)
         of = of[of["dataset_sha256"] == sha]
         lengths = of["n_updates"][[run not in here for run in of.itertuples(index=False, name=None)]]
-        found += [f"{k} of {n:,} steps on {name}" for n, k in lengths.value_counts().sort_index().items()]
-    return found
+        for n, k in lengths.value_counts().items():
+            on = found.setdefault(int(n), {})
+            on[name] = on.get(name, 0) + int(k)
+    return [
+        f"{sum(on.values())} of {n:,} steps on {next(iter(on)) if len(on) == 1 else f'{len(on)} data sets'}"
+        for n, on in sorted(found.items())
+    ]
