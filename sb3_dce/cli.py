@@ -217,8 +217,8 @@ def reproduce(
         ids=experiments.parse_ids(id_),
         scale=scale,
         out=out or Path("runs") / f"reproduce-{scale}",
-        datasets=_names(datasets),
-        agents=_names(agents, ";" if ";" in agents else ","),
+        datasets=_names(datasets, option="--datasets"),
+        agents=_names(agents, ";" if ";" in agents else ",", "--agents"),
         seeds=seeds,
         first_seed=first_seed,
         updates=None if updates is None else check_steps("--updates", updates),
@@ -260,8 +260,11 @@ def evaluate(
     console.print(f"return {outcome.mean:.1f} ± {outcome.std:.1f} over {len(outcome.returns)} episodes{score}")
 
 
-def _names(text: str, sign: str = ",") -> tuple[str, ...]:
-    return tuple(name.strip() for name in text.split(sign) if name.strip())
+def _names(text: str, sign: str = ",", option: str = "") -> tuple[str, ...]:
+    names = tuple(name.strip() for name in text.split(sign) if name.strip())
+    if text and not names and option:  # not all that there are
+        raise ConfigError(f"{option} {text!r} names none", key=option, hint="Leave it out for all, or name some.")
+    return names
 
 
 def _parse_overrides(pairs: list[str]) -> dict[str, Any]:

@@ -214,6 +214,16 @@ def _not_of_a_run(path: Path) -> CheckpointError:
     return CheckpointError("the file is not that of a run", where=str(path), path=path, hint=BEGIN_ANEW)
 
 
+def has_ended(folder: Path) -> bool:
+    """
+    Whether a run has an outcome, of whatever length, asked without reading it.
+
+    :param folder: any
+    :return: whether there is one of the files that :func:`write_result` and :func:`write_divergence` write
+    """
+    return any((folder / name).is_file() for name in ("result.json", "diverged.json"))
+
+
 def write_result(spec: RunSpec, folder: Path, evaluations: list[Evaluation], seconds: float) -> dict[str, Any]:
     """
     Write ``result.json``, the mark of a complete run.

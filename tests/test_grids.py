@@ -217,7 +217,7 @@ def test_list_names_every_experiment(data_folder: Path) -> None:
     assert outcome.code == 0
     for name in IDS:
         assert name in outcome.stdout
-    assert "480" in outcome.stdout  # runs of table 1 at full scale
+    assert "460" in outcome.stdout  # runs of table 1 at full scale; where a row is the one setting, both are one run
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ from sb3_dce.experiments.figures import draw, draw_profile
 from sb3_dce.experiments.grid import EMBEDDED, experiment_ids, load_experiment, variant_hash
 from sb3_dce.experiments.judging import CLOSE, HELD, NOT_HELD, UNTESTED, Verdict
 from sb3_dce.experiments.pages import coverage, usual_runs
+from sb3_dce.experiments.readings import mean_line
 from sb3_dce.experiments.reports import config_table, make_report, toy_table
 from sb3_dce.experiments.run_times import runtime_table
 from sb3_dce.experiments.tables import aggregate_tables, common_rows, long_table, score_table, seed_table
@@ -267,6 +268,8 @@ def test_runs_of_another_length_have_a_table_with_the_mean_of_their_last_evaluat
     longer += [run("DCE", CHEETAH, 0, 200_000, 7.0, 8.0), diverged("IQL", CHEETAH, 0, n_updates=100_000)]
     table = other_length_table(evidence_of(results.merge([*usual, slow, *longer])))
     assert table is not None
+    named = evidence_of(results.merge([*usual, slow, *longer]), n_updates=50_000)
+    assert other_length_table(named) is None, "there is no other length for who names one"
     shown = [cell(table, CHEETAH, column) for column in ("steps", "BC", "IQL", "DCE", "CQL")]
     assert shown == ["100,000", "11.0 ± 0.0 (6.5, 2 seeds)", "(1 diverged)", "11.0 ± 0.0 (6.5, 2 seeds)", "-"]
     assert len(table.rows) == 1, "one set has no total"
@@ -276,6 +279,22 @@ def test_runs_of_another_length_have_a_table_with_the_mean_of_their_last_evaluat
     assert table is not None
     assert cell(table, "walker2d-medium-sb3", "IQL") == "6.0", "two evaluations have no mean of the last ten beside them"
     assert [cell(table, "total", column) for column in ("steps", "BC", "IQL", "DCE")] == ["100,000", "17.0", "-", "-"]
+
+
+def test_seeds_evaluated_at_other_steps_count_by_their_own_last_evaluations(tmp_path: Path) -> None:
+    often = run_rows(TABLE, "DCE", CHEETAH, 0, curves={"score": [50.0] * 40})
+    rarely = run_rows(TABLE, "DCE", CHEETAH, 1, curves={"score": [0.0] * 15 + [10.0] * 5})
+    evidence = evidence_of(results.merge([often, rarely]))
+    table = long_table(evidence)
+    (row,) = [dict(zip(table.header, cells, strict=True)) for cells in table.rows if cells[2] == "DCE"]
+    assert row["mean_last_10_evaluations"] == "27.5000"
+    dce = evidence.experiment.variant("DCE")
+    assert evidence.jumps(dce, CHEETAH) == 0.0, "neither score moves"
+    curve = evidence.curve(dce, CHEETAH, "score")
+    assert list(mean_line(curve)) == [25.0] * 15 + [30.0] * 5, "where both were evaluated"
+    ended = curve.copy()
+    ended.loc[ended.index > 500, 1] = np.nan
+    assert list(mean_line(ended)) == [25.0] * 10 + [50.0] * 20, "one that diverged is waited for no more"
 
 
 def test_all_columns_of_the_long_table_are_over_the_same_seeds() -> None:
@@ -318,8 +337,8 @@ def test_scores_stand_seed_by_seed_where_there_are_several() -> None:
     longer = run_rows(TABLE, "DCE", CHEETAH, 1, 50.0, n_updates=2000)
     table = seed_table(evidence_of(results.merge([rows, longer, diverged("DCE", CHEETAH, 0, n_updates=2000)])))
     assert table is not None and table.rows == (
-        (CHEETAH, "DCE", "1,000", "15.0, 0.0, 3.0", "7.9"),
-        (CHEETAH, "DCE", "2,000", "diverged, 50.0", "-"),
+        (CHEETAH, "DCE", "cpu", "1,000", "15.0, 0.0, 3.0", "7.9"),
+        (CHEETAH, "DCE", "cpu", "2,000", "diverged, 50.0", "-"),
     )
     assert (
         "9a76" not in table.caption and "abababab" in table.caption and "commits" in table.caption
@@ -336,7 +355,17 @@ def test_one_setting_is_shown_seed_by_seed_where_its_schedule_is_another() -> No
     ]
     table = seed_table(evidence_of(results.merge(parts)))
     assert table is not None
-    assert [row[1:3] for row in table.rows] == [("DCE", "1,000"), ("DCE", "100,000"), ("DCE one setting", "100,000")]
+    shown = [(row[1], row[3]) for row in table.rows]
+    assert shown == [("DCE", "1,000"), ("DCE", "100,000"), ("DCE one setting", "100,000")]
+
+
+def test_seeds_of_two_precisions_are_told_apart_where_they_stand_one_by_one() -> None:
+    runs = [run_rows(TABLE, "BC", CHEETAH, seed, 40.0) for seed in (0, 1)]
+    evidence = evidence_of(results.merge([runs[0], runs[1].assign(device="cpu bf16-matmul")]))
+    seeds = seed_table(evidence)
+    assert seeds is not None
+    for table in (seeds, long_table(evidence)):
+        assert any("cpu and cpu bf16-matmul" in row for row in table.rows)
 
 
 def test_longer_runs_are_named_with_the_mean_of_their_last_evaluations() -> None:
@@ -502,7 +531,7 @@ def test_a_panel_is_as_long_as_its_own_lines(tmp_path: Path) -> None:
     assert ends == {"score": 100, "q_data": 200}, "BC has no runs of the length that the betas have"
     report = make_report(evidence)
     assert "Gradient steps: 100 to 200; seeds: 1;" in report.caption and "Further runs" not in report.caption, "both are drawn"
-    lengths = {(row[2], row[4]) for row in report.tables["long"].rows}
+    lengths = {(row[2], row[5]) for row in report.tables["long"].rows}
     assert {("beta 2", "100"), ("BC", "100")} <= lengths
     only = caption(evidence, [CHEETAH], [experiment.variant("beta 2"), experiment.variant("BC")])
     assert f"Further runs, of other lengths: 1 of 200 steps on {CHEETAH}." in only
@@ -660,6 +689,16 @@ def test_run_times_are_judged_by_order_distance_and_against_cql(cql: float, devi
     evidence = evidence_of(results.merge(parts), "run-times")
     (faster,) = [row for row in claim_table({"run-times": evidence}, {}).rows if row[0] == "C3"]
     assert (*(v.outcome for v in verdicts(evidence)), faster[2]) == outcomes
+
+
+def test_run_times_are_those_of_the_runs_made_for_them() -> None:
+    timing = load_experiment("run-times")
+    timed = [run_rows(timing, name, CHEETAH, 0, seconds=s) for name, s in (("BC", 4.0), ("IQL", 16.0), ("DCE", 24.0))]
+    others = [run_rows(TABLE, name, CHEETAH, 0, n_updates=50_000, seconds=50.0) for name in ("BC", "IQL", "DCE", "CQL")]
+    rows = results.merge([*timed, *others])
+    assert {row[2] for row in runtime_table(evidence_of(rows, "run-times")).rows} == {"4.0", "16.0", "24.0"}
+    table = runtime_table(evidence_of(results.merge(others), "run-times"))
+    assert {row[2] for row in table.rows} == {"1.0"}, "without any, those that there are"
 
 
 def test_claims_on_a_kind_of_data_are_not_tested_on_another() -> None:

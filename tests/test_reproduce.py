@@ -191,6 +191,62 @@ def test_runs_of_other_commands_become_rows_without_training(tmp_path: Path) -> 
     before = (tmp_path / "out" / "rows" / "table1.csv.gz").read_bytes()
     assert sb3_dce("reproduce", "table1", *arguments, "--import", str(tmp_path / "compare")).code == 0
     assert (tmp_path / "out" / "rows" / "table1.csv.gz").read_bytes() == before, "nothing is counted twice"
+    assert "imported: runs that have ended: 1; in no column: 1" in first.stdout, "it has another network than those there"
+
+
+def test_what_is_no_run_is_passed_over_by_the_import(tmp_path: Path) -> None:
+    run(RunSpec("dce", TINY, 5, 4, str(tmp_path / "runs" / "one"), 2, 1, QUICK))
+    for name, text in (("hydra", "defaults: [a]"), ("broken", "a: [1")):
+        (tmp_path / "runs" / name).mkdir()
+        (tmp_path / "runs" / name / "config.yml").write_text(text)
+    assert set(results.import_runs(tmp_path / "runs", "table1")["seed"]) == {5}
+
+
+def test_better_rows_that_are_imported_are_kept(tmp_path: Path) -> None:
+    run(RunSpec("dce", TINY, 5, 4, str(tmp_path / "runs" / "one"), 2, 2, QUICK))
+    found = results.import_runs(tmp_path / "runs", "table1")
+    fewer = found.assign(value=found["value"].where(found["metric"] != "n_episodes", 1.0))
+    results.write_rows(tmp_path / "out" / "rows" / "table1.csv.gz", fewer)
+    request = Request(("table1",), "smoke", tmp_path / "out", imports=(tmp_path / "runs",), report_only=True)
+    reproduce(request, QUIET)
+    kept, order = results.read_folder(tmp_path / "out" / "rows"), ["metric", "step"]
+    pd.testing.assert_frame_equal(kept.sort_values(order, ignore_index=True), found.sort_values(order, ignore_index=True))
+
+
+def test_files_of_an_earlier_call_go_when_nothing_is_shown_in_them(tmp_path: Path) -> None:
+    table = load_experiment("table1")
+    rows = [
+        run_rows(table, name, data, seed, 40.0, n_updates=n)
+        for name in ("BC", "IQL", "DCE")
+        for data in ("halfcheetah-medium-sb3", "hopper-medium-sb3")
+        for seed in (0, 1)
+        for n in (1000, 2000)
+    ]
+    results.write_rows(tmp_path / "rows" / "table1.csv.gz", results.merge(rows))
+    other = tmp_path / "tables" / "notes.md"
+    other.parent.mkdir()
+    other.write_text("mine")
+    request = Request(("table1",), "cpu", tmp_path, report_only=True)
+    for updates, present in ((None, True), (300, False)):
+        reproduce(replace(request, updates=updates), QUIET)
+        names = {path.stem for path in tmp_path.glob("*/table1-*")}
+        optional = {"table1-other-length", "table1-seeds", "table1-aggregates-sb3", "table1-profile-sb3"}
+        assert (names & optional == optional) if present else not names & optional
+        assert "table1-scores" in names and other.read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--agents", ","), "--agents ',' names none"),
+        (("--agents", ";"), "--agents ';' names none"),
+        (("--datasets", " , "), "--datasets ' , ' names none"),
+        (("--first-seed", "4294967295", "--seeds", "2"), "2 seeds from 4294967295 on end at 4294967296"),
+    ],
+)
+def test_what_would_start_something_else_is_refused(words: tuple[str, ...], message: str, tmp_path: Path) -> None:
+    outcome = sb3_dce("reproduce", "table1", *words, "--out", str(tmp_path / "out"))
+    assert outcome.code == 2 and message in outcome.stderr and not (tmp_path / "out").exists()
 
 
 def test_page_names_a_command_that_makes_the_same_page(tmp_path: Path) -> None:

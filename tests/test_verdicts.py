@@ -523,6 +523,18 @@ def test_flatter_curve_is_the_one_that_varies_less(slope: float, outcome: str) -
         assert one_of(outcomes("fig-cql-q", results.merge(rows)), "Q is flatter") == expected
 
 
+def test_more_seeds_make_no_agent_flatter() -> None:
+    experiment = load_experiment("fig-cql-q")
+    wave = 10.0 * np.sin(np.arange(50) * 2.0 * np.pi / 12.0)  # the mean over seeds of other phases is nearly flat
+    for counts in ((1, 4), (4, 1)):
+        rows = [
+            run_rows(experiment, name, CHEETAH, seed, curves={"q_data": np.roll(wave, 3 * seed) + 50.0}, n_updates=200_000)
+            for name, n in zip(("expectile 0.7", "without policy"), counts, strict=True)
+            for seed in range(n)
+        ]
+        assert one_of(outcomes("fig-cql-q", results.merge(rows)), "Q is flatter") == CLOSE
+
+
 def test_curve_without_any_spread_is_the_flatter_one() -> None:
     experiment = load_experiment("fig-cql-q")
     # a spread that no figure shows, below 2 % of Q, says nothing

@@ -9,7 +9,7 @@ import pandas as pd
 
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import Scale, Variant, source_of
-from sb3_dce.experiments.readings import runs_in, span
+from sb3_dce.experiments.readings import devices_in, runs_in, span
 
 LAST_POLICY = "last policy"
 
@@ -69,7 +69,7 @@ def _data(rows: pd.DataFrame) -> str:
     groups: dict[str, list[str]] = {}
     for name, of in rows.groupby("dataset", sort=False, observed=True):
         source = "of D4RL" if source_of(str(name)) == "D4RL" else "made with this package, not D4RL's"
-        how = f"{source} (run on {' and '.join(sorted(of['device'].unique()))})"
+        how = f"{source} (run on {devices_in(of)})"
         groups.setdefault(how, []).append(f"`{name}` {', '.join(h[:8] for h in of['dataset_sha256'].unique())}…")
     return "; ".join(f"{', '.join(names)}, {how}" for how, names in groups.items())
 

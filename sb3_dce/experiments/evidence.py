@@ -11,6 +11,7 @@ from sb3_dce.experiments.grid import Variant, settings_in_force
 from sb3_dce.experiments.readings import (
     at_end,
     curve_of,
+    last_of_each,
     last_tenth,
     late_mean,
     mean_over_seeds,
@@ -97,11 +98,11 @@ class Evidence(Selection):
 
         :param variant: of the experiment
         :param dataset_id: data
-        :return: standard deviation of the last three evaluations of a run, root of its mean square over the runs that count; 0
-            with fewer evaluations
+        :return: standard deviation of the last three evaluations of a run, root of its mean square over the runs that count
+            and have as many; 0 without any
         """
-        last = self.curve(variant, dataset_id, "score").tail(N_JUMPS)
-        return float(np.sqrt((last.std(ddof=1) ** 2).mean())) if len(last) == N_JUMPS and last.size else 0.0
+        last = last_of_each(self.curve(variant, dataset_id, "score"), N_JUMPS)
+        return float(np.sqrt((last.std(ddof=1) ** 2).mean())) if last.size else 0.0
 
     def n_diverged(self, variant: Variant, dataset_id: str) -> int:
         """

@@ -13,6 +13,7 @@ from sb3_dce.errors import ConfigError
 from sb3_dce.experiments.curves import panel_curves, variants_of, view_of
 from sb3_dce.experiments.evidence import UPDATES_PER_EPOCH, Evidence
 from sb3_dce.experiments.grid import Panel, planned_id
+from sb3_dce.experiments.readings import mean_line
 from sb3_dce.experiments.statistics import performance_profile
 from sb3_dce.experiments.tables import common_rows, compared, n_diverged
 
@@ -117,14 +118,15 @@ def _panel(evidence: Evidence, panel: Panel, axes: Axes) -> None:
     colors = _colors(evidence, panel, list(curves))
     evidence = view_of(evidence, panel)
     for number, (name, (curve, theory)) in enumerate(curves.items()):
-        color, epochs = colors[name], np.asarray(curve.index) / UPDATES_PER_EPOCH
+        color = colors[name]
         if curve.shape[1] > 1:
-            axes.plot(epochs, curve.to_numpy(), color=color, alpha=0.25, linewidth=0.7)
+            for _, seed in curve.items():
+                _plot(axes, seed.dropna(), color=color, alpha=0.25, linewidth=0.7)
         label = f"{name} ({curve.shape[1]} seeds)" if curve.shape[1] > 1 else name
         width = 2.4 - 1.2 * number / max(1, len(curves) - 1)  # what lies below another line can be seen
-        axes.plot(epochs, curve.mean(axis=1).to_numpy(), color=color, linewidth=width, label=label)
+        _plot(axes, mean_line(curve), color=color, linewidth=width, label=label)
         if theory is not None:
-            axes.plot(epochs, theory.to_numpy(), color=color, linestyle="--", linewidth=1.0, label=f"{name}, theory")
+            _plot(axes, theory, color=color, linestyle="--", linewidth=1.0, label=f"{name}, theory")
     axes.set_xlabel("epoch (1000 gradient steps)")
     axes.set_ylabel(LABELS[panel.metric], fontsize=9)
     axes.set_title(", ".join(part for part in (_data_title(evidence, panel), panel.title) if part), fontsize=10)
@@ -145,6 +147,10 @@ def _panel(evidence: Evidence, panel: Panel, axes: Axes) -> None:
     else:
         axes.set(xticks=[], yticks=[])
         axes.text(0.5, 0.5, _absence(evidence, panel), ha="center", va="center", transform=axes.transAxes, color="0.4")
+
+
+def _plot(axes: Axes, line: pd.Series, **settings: Any) -> None:
+    axes.plot(np.asarray(line.index) / UPDATES_PER_EPOCH, line.to_numpy(), **settings)
 
 
 def _keep_failures_small(axes: Axes) -> None:

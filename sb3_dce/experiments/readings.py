@@ -79,6 +79,31 @@ def of_seeds_that_ended(curve: pd.DataFrame, n_updates: int) -> pd.DataFrame:
     return curve.loc[:, curve.reindex([n_updates]).notna().iloc[0]].dropna(how="all")
 
 
+def last_of_each(curve: pd.DataFrame, n: int) -> pd.DataFrame:
+    """
+    The last values of each seed; seeds that were evaluated at other steps do not cut one another's short.
+
+    :param curve: one column per seed, indexed by gradient steps
+    :param n: number of values
+    :return: columns of the seeds that have as many, indexed by their number; empty without any
+    """
+    tails = {seed: values.dropna().tail(n).to_numpy() for seed, values in curve.items()}
+    return pd.DataFrame({seed: values for seed, values in tails.items() if len(values) == n})
+
+
+def mean_line(curve: pd.DataFrame) -> pd.Series:
+    """
+    Mean curve over seeds, at the steps at which all have a value that have one there or later.
+
+    :param curve: one column per seed, indexed by gradient steps
+    :return: mean by step; it goes on when a seed has diverged
+    """
+    here = curve.notna()
+    here_or_later = here[::-1].cummax()[::-1]
+    complete = here.any(axis=1) & (here == here_or_later).all(axis=1)
+    return curve[complete].mean(axis=1)
+
+
 def ended_scores(rows: pd.DataFrame) -> pd.DataFrame:
     """
     Course of the score of the seeds that did not diverge.
@@ -94,11 +119,11 @@ def late_mean(rows: pd.DataFrame) -> float | None:
     Mean of the last ten evaluations, beside which the last one is seen to be a jump or not.
 
     :param rows: of runs of one agent and length
-    :return: normalised score, over the seeds that have not diverged; ``None`` without runs, or if ten evaluations are all they
-        have
+    :return: normalised score, over the seeds that have not diverged; ``None`` without runs, or if ten evaluations are all that
+        one of them has
     """
     curve = ended_scores(rows)
-    return mean_over_seeds(curve.tail(N_LATE)) if len(curve) > N_LATE else None
+    return mean_over_seeds(last_of_each(curve, N_LATE)) if len(curve) and (curve.count() > N_LATE).all() else None
 
 
 def n_diverged_in(rows: pd.DataFrame) -> int:
@@ -109,6 +134,16 @@ def n_diverged_in(rows: pd.DataFrame) -> int:
     :return: runs; 0 without any
     """
     return int((rows["metric"] == "diverged").sum())
+
+
+def devices_in(rows: pd.DataFrame) -> str:
+    """
+    What runs were trained on, and in which precision.
+
+    :param rows: any
+    :return: such as "cpu and cpu bf16-matmul"
+    """
+    return " and ".join(sorted(rows["device"].unique()))
 
 
 def _n_agents_by_length(runs: pd.DataFrame) -> pd.Series:

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from stable_baselines3.common.utils import get_device
 
-from sb3_dce.checks import check_choice, check_ends_with_evaluation, did_you_mean
+from sb3_dce.checks import LAST_SEED, check_choice, check_ends_with_evaluation, did_you_mean
 from sb3_dce.data.catalog import resolve
 from sb3_dce.data.hashes import sha256_once
 from sb3_dce.data.locate import search
@@ -30,10 +30,13 @@ from sb3_dce.experiments.grid import (
     experiment_ids,
     load_experiment,
     present_datasets,
+    variant_hash,
 )
 from sb3_dce.experiments.pages import check_page, write_page
+from sb3_dce.experiments.readings import runs_in
 from sb3_dce.experiments.reports import Report, count, make_report
 from sb3_dce.experiments.run import execute, is_complete
+from sb3_dce.experiments.run_times import is_hastened
 from sb3_dce.experiments.tables import parts_of
 from sb3_dce.hyperparams import full_name
 from sb3_dce.launch import raise_first
@@ -50,6 +53,11 @@ PRESENT = "present"
 WIDE = 12
 ABSENT = (": no data", ": not run")
 HIDDEN = ("paper: ", "D4RL set")
+# Files of an experiment that there are for some rows only.
+NOT_ALWAYS = (
+    *(f"tables/{{}}-{name}.*" for name in ("other-length", "equal-steps", "seeds", "aggregates-*")),
+    *(f"figures/{{}}{name}.{ending}" for name in ("", "-profile-*") for ending in ("png", "svg")),
+)
 # Longest wait for another call with the same folder, seconds.
 WAIT = 7 * 24 * 3600.0
 
@@ -130,11 +138,13 @@ def reproduce(request: Request, console: Console) -> dict[str, Report]:
         request.out.mkdir(parents=True, exist_ok=True)
         # two calls with one folder take turns: they may have runs in common
         with exclusive(request.out / ".lock", limit=WAIT, note=lambda text: console.print(text, markup=False)):
-            rows, errors = _train(request, experiments, scales, console)
+            imported = _imported(request)
+            rows, errors = _train(request, experiments, scales, imported, console)
     else:
         errors = []
-        rows = results.merge([_known(request), *(results.import_runs(f, request.ids[0]) for f in request.imports)])
-        _keep_rows(rows, request, results.empty())
+        imported = _imported(request)
+        rows = results.merge([_known(request), imported])
+        _keep_rows(rows, request)
         # runs of an unfinished call with this folder are shown, and left for it to keep
         here = replace(request, datasets=(PRESENT,))
         planned = [run for e in experiments for run in plan_runs(e, scales[e.id], here)]
@@ -147,6 +157,8 @@ def reproduce(request: Request, console: Console) -> dict[str, Report]:
         length = request.updates if request.report_only else scales[experiment.id].updates
         evidence = Evidence(experiment, rows, scales[experiment.id], length, hash_here)
         evidences[experiment.id], reports[experiment.id] = evidence, _report(evidence, request.out, console)
+    if request.imports:
+        _say_imported(imported, evidences, console)
     if request.page is not None:
         write_page(request.page, request.out, evidences, reports, request.scale, command_of(request))
         console.print(f"page   {request.page}", markup=False)
@@ -169,6 +181,11 @@ def _check_request(request: Request) -> None:
     if lacking is not None and request.ray_address is None and not request.report_only:
         hint = "Leave it out: float32 runs everywhere."
         raise ConfigError(f"--precision {request.precision} needs {lacking}", key="--precision", hint=hint)
+    for scale in (scale_of(load_experiment(name), request) for name in request.ids):
+        if request.first_seed + scale.seeds - 1 > LAST_SEED:
+            what = f"{scale.seeds} seeds from {request.first_seed} on end at {request.first_seed + scale.seeds - 1}"
+            hint = f"The last seed there can be is {LAST_SEED}: begin with a smaller one, or take fewer."
+            raise ConfigError(what, key="--first-seed", hint=hint)
     if request.report_only and (request.datasets or request.agents or request.seeds or request.first_seed):
         hint = "It reports all rows: leave out --datasets, --agents, --seeds and --first-seed."
         raise ConfigError("--report-only trains nothing", key="--report-only", hint=hint)
@@ -201,24 +218,34 @@ def _known(request: Request) -> pd.DataFrame:
     return results.merge([results.read_folder(request.out / "rows"), *map(results.read_folder, request.reuse)])
 
 
+def _imported(request: Request) -> pd.DataFrame:
+    return results.merge(results.import_runs(folder, request.ids[0]) for folder in request.imports)
+
+
 def _train(
-    request: Request, experiments: list[Experiment], scales: dict[str, Scale], console: Console
+    request: Request, experiments: list[Experiment], scales: dict[str, Scale], imported: pd.DataFrame, console: Console
 ) -> tuple[pd.DataFrame, list[BaseException]]:
     """Run what is missing and keep its rows; all rows there are then, and errors of runs."""
     planned = [run for e in experiments for run in plan_runs(e, scales[e.id], request)]
-    imported = results.merge(results.import_runs(folder, request.ids[0]) for folder in request.imports)
     known = results.merge([_known(request), imported])
     done = results.done_runs(known, planned)
     for run in {run.spec.folder: run for run in planned}.values():
         refuse_other_run(_with_its_precision(run.spec), Path(run.spec.folder))
-    _say_plan(planned, done, scales, request.precision, console)
+    _say_plan(planned, done, scales, request.precision, known, console)
     diverged, errors = execute(planned, done, request.workers, request.device, request.ray_address, console)
     for text in diverged:
         console.print(f"diverged: {text}", markup=False)
     fresh = results.planned_rows(planned)  # first, since a run that is known by fewer episodes has been trained again
     rows = results.merge([fresh, known])
-    _keep_rows(rows, request, fresh)
+    _keep_rows(rows, request)
     return rows, errors
+
+
+def _say_imported(imported: pd.DataFrame, evidences: dict[str, Evidence], console: Console) -> None:
+    """Settings of a run that no column has, such as a scale's, are easily overlooked."""
+    runs = set(runs_in(imported).itertuples(index=False, name=None))
+    in_columns = {run for e in evidences.values() for run in e.runs_in_columns().itertuples(index=False, name=None)}
+    console.print(f"imported: runs that have ended: {len(runs)}; in no column: {len(runs - in_columns)}", markup=False)
 
 
 def show_list(console: Console) -> None:
@@ -243,9 +270,13 @@ def _count(experiment: Experiment, scale: Scale) -> int:
     """Runs of a whole grid, whether its data are here or not; two variants may be one run."""
     if scale.source == "embedded":
         return len({run.spec.folder for run in expand(experiment, scale, Path())})
-    return scale.seeds * sum(
-        v.datasets is None or dataset.paper in v.datasets for dataset in experiment.datasets for v in experiment.variants
-    )
+    agents = {
+        (dataset.paper, v.algo, variant_hash(v, dataset.paper, scale))
+        for dataset in experiment.datasets
+        for v in experiment.variants
+        if v.datasets is None or dataset.paper in v.datasets
+    }
+    return scale.seeds * len(agents)
 
 
 def scale_of(experiment: Experiment, request: Request) -> Scale:
@@ -313,7 +344,12 @@ def _with_its_precision(spec: RunSpec) -> RunSpec:
 
 
 def _say_plan(
-    planned: list[PlannedRun], done: set[tuple[Any, ...]], scales: dict[str, Scale], precision: str, console: Console
+    planned: list[PlannedRun],
+    done: set[tuple[Any, ...]],
+    scales: dict[str, Scale],
+    precision: str,
+    known: pd.DataFrame,
+    console: Console,
 ) -> None:
     runs = {run.spec.folder: run for run in planned}
     complete = sum(run.key in done or is_complete(run.spec) for run in runs.values())
@@ -321,7 +357,8 @@ def _say_plan(
     if runs:
         lengths = ", ".join(dict.fromkeys(f"{run.spec.n_updates:,}" for run in runs.values()))
         console.print(f"{len(runs)} runs of {lengths} gradient steps, {complete} of them complete; data: {data}", markup=False)
-    if complete and precision != "float32":
+    of_plan = known[[key in done for key in known[results.PLAN_KEY].itertuples(index=False, name=None)]]
+    if complete and (precision != "float32" or any(is_hastened(device) for device in of_plan["device"].unique())):
         console.print("complete runs are taken with the precision they have", markup=False)
     small = next((scale for scale in scales.values() if scale.source == "embedded"), None)
     if small is not None and runs:
@@ -340,10 +377,10 @@ def _say_plan(
             console.print(f"at this scale {algo} has {settings}", markup=False)
 
 
-def _keep_rows(rows: pd.DataFrame, request: Request, fresh: pd.DataFrame) -> None:
-    """One file per experiment; what a reused folder holds is not copied, what has just been trained replaces older rows."""
+def _keep_rows(rows: pd.DataFrame, request: Request) -> None:
+    """One file per experiment, of runs that are new or have other rows now; what a reused folder holds is not copied."""
     folder = request.out / "rows"
-    new = results.without(rows, results.without(_known(request), fresh))
+    new = results.changed(rows, _known(request))
     for name in new["experiment"].unique():
         path = folder / f"{name}.csv.gz"
         before = [results.read_rows(path)] if path.is_file() else []
@@ -363,12 +400,12 @@ def _report(evidence: Evidence, out: Path, console: Console) -> Report:
     for part in parts_of(evidence):
         if f"aggregates-{part}" in report.tables:
             written += draw_profile(evidence, part, out / "figures", f"{experiment.id}-profile-{part}")
-    if not report.has_figure:
-        for ending in ("png", "svg"):  # of rows that are no longer there
-            (out / "figures" / f"{experiment.id}.{ending}").unlink(missing_ok=True)
-    else:
+    if report.has_figure:
         written += draw(evidence, out / "figures", experiment.id)
         console.print(report.caption, markup=False)
+    for path in (file for pattern in NOT_ALWAYS for file in out.glob(pattern.format(experiment.id))):
+        if path not in written:  # of rows that are no longer there, or of a call that showed others
+            path.unlink()
     for verdict in report.verdicts:
         console.print(f"  {verdict.outcome:<20} {verdict.claim}   [{verdict.numbers}]", markup=False)
     if report.verdicts:

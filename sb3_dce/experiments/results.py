@@ -28,7 +28,7 @@ from sb3_dce.errors import CheckpointError, ConfigError, SB3DCEError
 from sb3_dce.evaluation import Evaluation, read_evaluations
 from sb3_dce.experiments.grid import PlannedRun
 from sb3_dce.files import write_atomically
-from sb3_dce.run_files import progress_logs, read_config, read_divergence, read_result
+from sb3_dce.run_files import has_ended, progress_logs, read_config, read_divergence, read_result
 
 COLUMNS = (
     "experiment",
@@ -125,8 +125,9 @@ def import_runs(folder: Path, experiment: str, planned: Iterable[PlannedRun] = (
     :return: rows of those that are complete or have diverged, each run once
     """
     of_plan = _experiments(planned)
-    folders = [path.parent for path in sorted(folder.rglob("config.yml"))]
-    found = [rows_of_run(path, of_plan.get(path, experiment)) for path in folders]
+    # a file of that name alone may be any other program's
+    ended = [path.parent for path in sorted(folder.rglob("config.yml")) if has_ended(path.parent)]
+    found = [rows_of_run(path, of_plan.get(path, experiment)) for path in ended]
     return merge(rows for rows in found if rows is not None)
 
 
@@ -179,6 +180,20 @@ def without(rows: pd.DataFrame, others: pd.DataFrame) -> pd.DataFrame:
     known = set(others[RUN_KEY].itertuples(index=False, name=None))
     keys = rows[RUN_KEY].itertuples(index=False, name=None)
     return rows[np.array([key not in known for key in keys], dtype=bool)]  # a list would choose columns if there are no rows
+
+
+def changed(rows: pd.DataFrame, before: pd.DataFrame) -> pd.DataFrame:
+    """
+    Rows of the runs that are not among others just as they are: new runs, and those of which there is more to say now.
+
+    :param rows: rows
+    :param before: rows
+    :return: part of ``rows``, whole runs
+    """
+    known = set(before.itertuples(index=False, name=None))
+    other = np.array([row not in known for row in rows.itertuples(index=False, name=None)], dtype=bool)
+    keys = set(rows[other][RUN_KEY].itertuples(index=False, name=None))
+    return rows[np.array([key in keys for key in rows[RUN_KEY].itertuples(index=False, name=None)], dtype=bool)]
 
 
 def done_runs(rows: pd.DataFrame, planned: Iterable[PlannedRun]) -> set[tuple[Any, ...]]:

@@ -51,6 +51,16 @@ def runtime_table(evidence: Evidence) -> TextTable:
     return TextTable(header, tuple(rows), f"{caption(evidence, ids, listed)} {note}")
 
 
+def is_hastened(device: str) -> bool:
+    """
+    Whether a run had rounded products.
+
+    :param device: of rows, with the precision behind it where that is not float32
+    :return: true for all other precisions
+    """
+    return device.rpartition(" ")[2] in HASTENED
+
+
 def has_fewer_draws(evidence: Evidence, variant: Variant) -> bool:
     """
     Whether the scale sets the number of dropout passes or OOD actions, so that updates are cheaper than the authors'.
@@ -94,7 +104,7 @@ def run_times(evidence: Evidence, variant: Variant, rows: pd.DataFrame) -> list[
     fewer = has_fewer_draws(evidence, variant) or evidence.scale.source == "embedded"
     alone = rows[(rows["metric"] == "seconds") & ~rows["device"].str.contains("population")]
     return [
-        RunTime(1000.0 * value / n_updates, device, fewer or device.rpartition(" ")[2] in HASTENED)
+        RunTime(1000.0 * value / n_updates, device, fewer or is_hastened(device))
         for value, n_updates, device in zip(alone["value"], alone["n_updates"], alone["device"], strict=True)
     ]
 

@@ -110,9 +110,8 @@ class Selection:
     @property
     def left_out(self) -> int:
         """Number of runs of the variants that do not count, since they are on another version of a file than is taken."""
-        names = [EMBEDDED] if self.scale.source == "embedded" else [name for d in self.experiment.datasets for name in d.ids]
-        own = {name: self.every_run(name, self.experiment.variants)["dataset_sha256"] for name in names}
-        return sum(int((hashes != self._file(name)).sum()) for name, hashes in own.items() if len(hashes))
+        runs = self.runs_in_columns()[["dataset", "dataset_sha256"]]
+        return sum(sha != self._file(name) for name, sha in runs.itertuples(index=False, name=None))
 
     @cached_property
     def _groups(self) -> dict[tuple[str, str, str], pd.DataFrame]:
@@ -234,13 +233,17 @@ class Selection:
         paper's agents with runs there have; else that of most variants, the longest of several.
 
         A row of a table thus moves on to longer runs before the slowest agents have them, as the paper's runs are far longer
-        than any of ours; a figure keeps all its lines.
+        than any of ours; a figure keeps all its lines. Times are those of the runs that were made for them, where there are
+        any: a CPU executes long runs otherwise.
 
         :param dataset_id: data
         :return: gradient steps; ``None`` without runs of it
         """
         if dataset_id not in self._length_of:
-            runs = runs_in(self._of_any_length(dataset_id))
+            rows = self._of_any_length(dataset_id)
+            if self.experiment.report == TIMING and (timed := rows["experiment"] == TIMING).any():
+                rows = rows[timed]
+            runs = runs_in(rows)
             if self._n_updates is not None:
                 runs = runs[runs["n_updates"] == self._n_updates]
             papers = self._of_the_papers_agents(dataset_id, runs) if self.experiment.report == "table" else runs.iloc[:0]
@@ -258,8 +261,11 @@ class Selection:
         Length at which the paper's agents of a row are shown a second time, after more or fewer steps.
 
         :param dataset_id: data
-        :return: of the lengths but the row's that which most of them have, the longest of several; ``None`` without such runs
+        :return: of the lengths but the row's that which most of them have, the longest of several; ``None`` without such runs,
+            or if the caller named a length
         """
+        if self._n_updates is not None:
+            return None
         runs = self._of_the_papers_agents(dataset_id, runs_in(self._of_any_length(dataset_id)))
         is_of_row = runs["n_updates"] == self.n_updates(dataset_id)
         agents = set(runs[is_of_row]["config_hash"])
@@ -365,6 +371,15 @@ class Selection:
         cells = [(v, name) for name in dataset_ids for v in variants]
         parts = [part for cell in cells for part in (self.rows_of(*cell), self.of_other_length(*cell))]
         return pd.concat(parts) if parts else self._rows.iloc[:0]
+
+    def runs_in_columns(self) -> pd.DataFrame:
+        """
+        All runs that the grid has a place for, whether they are shown or not.
+
+        :return: one line per run, with the columns ``RUN_KEY``
+        """
+        names = [EMBEDDED] if self.scale.source == "embedded" else [name for d in self.experiment.datasets for name in d.ids]
+        return pd.concat([runs_in(self._rows.iloc[:0]), *(self.every_run(n, self.experiment.variants) for n in names)])
 
     def every_run(self, dataset_id: str, variants: Iterable[Variant]) -> pd.DataFrame:
         """

@@ -12,7 +12,7 @@ from sb3_dce.experiments.captions import caption, caption_of
 from sb3_dce.experiments.evidence import Evidence
 from sb3_dce.experiments.grid import Variant, source_of
 from sb3_dce.experiments.paper import MIXED_PROTOCOLS, paper_score, paper_total
-from sb3_dce.experiments.readings import N_LATE, at_end, ended_scores, n_diverged_in
+from sb3_dce.experiments.readings import N_LATE, at_end, devices_in, ended_scores, last_of_each, mean_over_seeds, n_diverged_in
 from sb3_dce.experiments.statistics import (
     N_RESAMPLES,
     Interval,
@@ -351,10 +351,13 @@ def seed_table(evidence: Evidence) -> TextTable | None:
                 each = ["diverged" if e.metric == "diverged" else f"{e.value:.1f}" for e in ends.itertuples()]
                 whole = ends[ends["metric"] == "score"]["value"].to_numpy(dtype=float)
                 spread = f"{sample_std(whole):.1f}" if len(whole) > 1 else "-"
-                rows.append((name, variant.name, f"{length:,}", ", ".join(each), spread))
+                rows.append((name, variant.name, devices_in(runs), f"{length:,}", ", ".join(each), spread))
     if not rows:
         return None
-    header = ("data", "agent", "gradient steps", "last score of each seed, in their order", "sample standard deviation")
+    header = (
+        *("data", "agent", "device and precision", "gradient steps", "last score of each seed, in their order"),
+        "sample standard deviation",
+    )
     agents = [v for v in evidence.experiment.variants if any(v.name == row[1] for row in rows)]
     return TextTable(header, tuple(rows), caption_of(evidence, pd.concat(shown), agents))
 
@@ -367,7 +370,8 @@ def long_table(evidence: Evidence) -> TextTable:
     :return: one line per data, agent and length: last score, mean of the last ten evaluations, best, per seed
     """
     header = (
-        *("dataset", "source", "agent", "hyperparameters", "n_updates", "n_seeds", "n_diverged", "mean", "std", "ci_low"),
+        *("dataset", "source", "agent", "hyperparameters", "device", "n_updates", "n_seeds", "n_diverged"),
+        *("mean", "std", "ci_low"),
         *("ci_high", "mean_paper_episodes", "mean_last_10_evaluations", "mean_best_evaluation", "scores"),
         *("paper_dataset", "paper_score", "paper_std"),
     )
@@ -384,14 +388,14 @@ def long_table(evidence: Evidence) -> TextTable:
                 few = at_end(runs, "score_paper_episodes")
                 curve = ended_scores(runs)
                 paper_mode = float(few.mean()) if len(few) else float("nan")
-                last_ten = float(curve.tail(N_LATE).mean().mean()) if len(curve) >= N_LATE else float("nan")
-                late = (last_ten, float(curve.max().mean()))
+                last_ten = mean_over_seeds(last_of_each(curve, N_LATE))
+                late = (float("nan") if last_ten is None else last_ten, float(curve.max().mean()))
                 values = (float(scores.mean()), sample_std(scores), low, high, paper_mode, *late)
                 numbers = ["" if np.isnan(v) else f"{v:.4f}" for v in values] + [" ".join(f"{s:.4f}" for s in scores)]
             paper = evidence.paper_id(dataset)
             cell = None if variant.paper is None else paper_score(paper, variant.paper)
             printed = ["" if v is None else f"{v:g}" for v in ((None, None) if cell is None else (cell.score, cell.std))]
             settings = runs["hyperparameters"].iloc[0]
-            start = [name, source_of(name), variant.name, settings, str(length), str(len(scores)), str(lost)]
+            start = [name, source_of(name), variant.name, settings, devices_in(runs), str(length), str(len(scores)), str(lost)]
             rows.append((*start, *numbers, paper, *printed))
     return TextTable(header, tuple(rows), "")

@@ -68,7 +68,10 @@ SETTLED = round(5 / (TAU * (1 - GAMMA)))
 
 
 def _second_halves(evidence: Evidence, names: list[str], measure: Callable[[np.ndarray], float]) -> Values:
-    """A measure of the second half of each variant's curve of in-data Q (mean over seeds), where that has settled."""
+    """
+    A measure of the second half of each variant's curve of in-data Q, mean over seeds, where that has settled. It is taken of
+    each seed: a mean curve over more seeds is flatter, whatever the agent.
+    """
     evidence = evidence.among(names)
     dataset_id, values = evidence.id_of(None), scoped(evidence)
     if dataset_id is not None and (evidence.n_updates(dataset_id) or 0) < 2 * SETTLED:
@@ -78,7 +81,7 @@ def _second_halves(evidence: Evidence, names: list[str], measure: Callable[[np.n
             curve = evidence.curve(evidence.experiment.variant(name), dataset_id, "q_data")
             half = of_seeds_that_ended(curve[curve.index > n_updates / 2], n_updates)
             if len(half) >= FEWEST_POINTS:  # none if all of its seeds diverged before
-                values[name] = measure(half.mean(axis=1).to_numpy())
+                values[name] = float(np.mean([measure(seed.dropna().to_numpy()) for _, seed in half.items()]))
     return values
 
 
@@ -143,7 +146,7 @@ def _beta(evidence: Evidence) -> list[Verdict]:
         judge("In-data Q falls as beta rises", f"Q of beta 0 > 2 > 4 > 8 ({TENTH})", falling(q_values), text_of(q_values)),
         judge(
             "In-data Q of beta 2 has a large wave",
-            "the curve's second half deviates from a straight line by a standard deviation of at least "
+            "the curve's second half deviates from a straight line by a standard deviation (mean over seeds) of at least "
             f"{LARGE_WAVE:.0%} of its Q, and the largest of all betas by more than a factor of {FLATTER:g}",
             None if len(waves) < len(betas) or q_values is None else _has_largest_wave(waves, "beta 2", q_values["beta 2"]),
             _shape_text(waves, 2),
@@ -341,8 +344,8 @@ def _cql_q(evidence: Evidence) -> list[Verdict]:
         seen = any(spreads[name] >= LARGE_WAVE * abs(q_values[name]) for name in names)
         holds = _varies_more(spreads[names[0]], spreads[names[1]]) if seen else CLOSE
     rule = (
-        f"standard deviation of the curve over its second half is smaller, by more than a factor of {FLATTER:g}; too close to "
-        f"tell where neither is {LARGE_WAVE:.0%} of its Q"
+        "standard deviation of the curve over its second half (mean over seeds) is smaller, by more than a factor of "
+        f"{FLATTER:g}; too close to tell where neither is {LARGE_WAVE:.0%} of its Q"
     )
     return [*found, judge("Without a policy in the penalty Q is flatter", rule, holds, _shape_text(spreads, 2))]
 
