@@ -257,8 +257,8 @@ def summarize(
     if rows and _unevaluated(rows):
         notes.append(
             "Nothing was evaluated: no environment is known for these data, or its simulator is not installed. action_dist is "
-            "the mean distance of the policy's actions from the data's (scaled to [-1, 1]; BC's and IQL's are means, TD3+BC's have "
-            "no spread, so that these are nearer by themselves), q_data what the critics expect. "
+            "the mean distance of the policy's actions from the data's (scaled to [-1, 1]; BC's and IQL's are means, TD3+BC's "
+            "have no spread, so that these are nearer by themselves), q_data what the critics expect. "
             "They say which agents stay near the data and which critics diverge, not which policy is best."
         )
     elif without := [row.agent for row in rows if np.isnan(row.mean)]:
