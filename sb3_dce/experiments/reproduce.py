@@ -134,15 +134,14 @@ def reproduce(request: Request, console: Console) -> dict[str, Report]:
     _check_request(request)
     experiments = [load_experiment(name) for name in request.ids]
     scales = {e.id: scale_of(e, request) for e in experiments}
+    imported = results.merge(results.import_runs(folder, request.ids[0]) for folder in request.imports)
     if not request.report_only:
         request.out.mkdir(parents=True, exist_ok=True)
         # two calls with one folder take turns: they may have runs in common
         with exclusive(request.out / ".lock", limit=WAIT, note=lambda text: console.print(text, markup=False)):
-            imported = _imported(request)
             rows, errors = _train(request, experiments, scales, imported, console)
     else:
         errors = []
-        imported = _imported(request)
         rows = results.merge([_known(request), imported])
         _keep_rows(rows, request)
         # runs of an unfinished call with this folder are shown, and left for it to keep
@@ -181,11 +180,6 @@ def _check_request(request: Request) -> None:
     if lacking is not None and request.ray_address is None and not request.report_only:
         hint = "Leave it out: float32 runs everywhere."
         raise ConfigError(f"--precision {request.precision} needs {lacking}", key="--precision", hint=hint)
-    for scale in (scale_of(load_experiment(name), request) for name in request.ids):
-        if request.first_seed + scale.seeds - 1 > LAST_SEED:
-            what = f"{scale.seeds} seeds from {request.first_seed} on end at {request.first_seed + scale.seeds - 1}"
-            hint = f"The last seed there can be is {LAST_SEED}: begin with a smaller one, or take fewer."
-            raise ConfigError(what, key="--first-seed", hint=hint)
     if request.report_only and (request.datasets or request.agents or request.seeds or request.first_seed):
         hint = "It reports all rows: leave out --datasets, --agents, --seeds and --first-seed."
         raise ConfigError("--report-only trains nothing", key="--report-only", hint=hint)
@@ -216,10 +210,6 @@ def hash_here(dataset_id: str) -> str | None:
 
 def _known(request: Request) -> pd.DataFrame:
     return results.merge([results.read_folder(request.out / "rows"), *map(results.read_folder, request.reuse)])
-
-
-def _imported(request: Request) -> pd.DataFrame:
-    return results.merge(results.import_runs(folder, request.ids[0]) for folder in request.imports)
 
 
 def _train(
@@ -286,15 +276,18 @@ def scale_of(experiment: Experiment, request: Request) -> Scale:
     :param experiment: one of the request's
     :param request: with its changes of length, evaluations and seeds
     :return: the scale with them
-    :raises ConfigError: if the last evaluation of what is trained would not be at the end
+    :raises ConfigError: if the last evaluation of what is trained would not be at the end, or for too large seeds
     """
     scale = experiment.scales[request.scale]
     updates = request.updates or scale.updates
     every = request.eval_freq or min(scale.eval_freq, updates)
     if not request.report_only:  # runs that are there say themselves when they were evaluated
         check_ends_with_evaluation(updates, every)
-    scale = replace(scale, updates=updates, eval_freq=every)
-    return scale if request.seeds is None else replace(scale, seeds=request.seeds)
+    seeds = request.seeds or scale.seeds
+    if (last := request.first_seed + seeds - 1) > LAST_SEED:
+        hint = f"The last seed there can be is {LAST_SEED}: begin with a smaller one, or take fewer."
+        raise ConfigError(f"{seeds} seeds from {request.first_seed} on end at {last}", key="--first-seed", hint=hint)
+    return replace(scale, updates=updates, eval_freq=every, seeds=seeds)
 
 
 def plan_runs(experiment: Experiment, scale: Scale, request: Request) -> list[PlannedRun]:

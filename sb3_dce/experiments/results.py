@@ -192,8 +192,7 @@ def changed(rows: pd.DataFrame, before: pd.DataFrame) -> pd.DataFrame:
     """
     known = set(before.itertuples(index=False, name=None))
     other = np.array([row not in known for row in rows.itertuples(index=False, name=None)], dtype=bool)
-    keys = set(rows[other][RUN_KEY].itertuples(index=False, name=None))
-    return rows[np.array([key in keys for key in rows[RUN_KEY].itertuples(index=False, name=None)], dtype=bool)]
+    return without(rows, without(rows, rows[other]))
 
 
 def done_runs(rows: pd.DataFrame, planned: Iterable[PlannedRun]) -> set[tuple[Any, ...]]:
