@@ -39,6 +39,8 @@ from sb3_dce.evaluation import Evaluation
 from sb3_dce.files import cannot_read, quoted, write_text
 from sb3_dce.precision import missing_for
 
+# Files of a run that has ended, one of which it has.
+MARKS = ("result.json", "diverged.json")
 BEGIN_ANEW = "Delete the run's folder to run it anew, or choose another one with --out."
 
 
@@ -221,7 +223,7 @@ def has_ended(folder: Path) -> bool:
     :param folder: any
     :return: whether there is one of the files that :func:`write_result` and :func:`write_divergence` write
     """
-    return any((folder / name).is_file() for name in ("result.json", "diverged.json"))
+    return any((folder / name).is_file() for name in MARKS)
 
 
 def write_result(spec: RunSpec, folder: Path, evaluations: list[Evaluation], seconds: float) -> dict[str, Any]:

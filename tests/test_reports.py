@@ -281,7 +281,7 @@ def test_runs_of_another_length_have_a_table_with_the_mean_of_their_last_evaluat
     assert [cell(table, "total", column) for column in ("steps", "BC", "IQL", "DCE")] == ["100,000", "17.0", "-", "-"]
 
 
-def test_seeds_evaluated_at_other_steps_count_by_their_own_last_evaluations(tmp_path: Path) -> None:
+def test_seeds_evaluated_at_other_steps_count_by_their_own_last_evaluations() -> None:
     often = run_rows(TABLE, "DCE", CHEETAH, 0, curves={"score": [50.0] * 40})
     rarely = run_rows(TABLE, "DCE", CHEETAH, 1, curves={"score": [0.0] * 15 + [10.0] * 5})
     evidence = evidence_of(results.merge([often, rarely]))

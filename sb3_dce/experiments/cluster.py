@@ -28,10 +28,7 @@ from sb3_dce.errors import ConfigError, DatasetIntegrityError, DivergenceError, 
 from sb3_dce.files import write_atomically
 from sb3_dce.launch import train_one
 from sb3_dce.processes import threads_from_environment
-from sb3_dce.run_files import RunSpec, read_result, source_commit
-
-# Written last: they are the marks of a complete run.
-MARKS = ("result.json", "diverged.json")
+from sb3_dce.run_files import MARKS, RunSpec, read_result, source_commit
 
 
 class Outcome(NamedTuple):
@@ -206,7 +203,7 @@ def receive(folder: Path, files: dict[str, bytes]) -> None:
     if not files:
         return
     folder.mkdir(parents=True, exist_ok=True)
-    for name in sorted(files, key=lambda name: (name in MARKS, name)):
+    for name in sorted(files, key=lambda name: (name in MARKS, name)):  # the marks of a run that has ended come last
         if Path(name).name == name:  # a node may not write elsewhere
             with write_atomically(folder / name) as stream:
                 stream.write(files[name])
