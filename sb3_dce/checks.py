@@ -90,6 +90,22 @@ def check_seed(seed: Any) -> int | None:
     return int(seed)
 
 
+def check_seeds(first: int, n: int) -> range:
+    """
+    Seeds of several runs, before the first of them begins.
+
+    :param first: the first of them
+    :param n: how many
+    :return: that many in a row
+    :raises ConfigError: if the last of them is too large for NumPy's generators
+    """
+    last = first + n - 1
+    if last > LAST_SEED:
+        hint = f"The last seed there can be is {LAST_SEED}: begin with a smaller one, or take fewer."
+        raise ConfigError(f"{n} seeds from {first} on end at {last}", key="--first-seed", hint=hint)
+    return range(first, last + 1)
+
+
 def check_steps(name: str, value: Any) -> int:
     """
     A number of gradient steps as an ``int``, also from a float such as ``1e6``; 0 is allowed.

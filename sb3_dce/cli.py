@@ -15,7 +15,7 @@ import yaml
 from rich.console import Console
 
 from sb3_dce import cli_datasets
-from sb3_dce.checks import LAST_SEED, SEEDS_PER_EVALUATION, check_steps
+from sb3_dce.checks import LAST_SEED, SEEDS_PER_EVALUATION, check_seeds, check_steps
 from sb3_dce.cli_datasets import DatasetArgument
 from sb3_dce.cli_recording import importable_here
 from sb3_dce.errors import ConfigError, SB3DCEError
@@ -98,7 +98,7 @@ def train(
         algo=algo,
         dataset=dataset,
         n_updates=None if updates is None else check_steps("--updates", updates),
-        seeds=range(first_seed, first_seed + seeds),
+        seeds=check_seeds(first_seed, seeds),
         eval_freq=eval_freq,
         n_eval_episodes=eval_episodes,
         workers=workers or usable_cores(),
@@ -145,7 +145,7 @@ def compare(
     find_file(dataset)  # a missing file is said before PyTorch is imported
     from sb3_dce import compare as comparison
 
-    names = list(_names(algos))
+    names = list(_names(algos, "--algos"))
     if report_only:
         comparison.report(dataset, names, out, console)
         return
@@ -217,8 +217,8 @@ def reproduce(
         ids=experiments.parse_ids(id_),
         scale=scale,
         out=out or Path("runs") / f"reproduce-{scale}",
-        datasets=_names(datasets, option="--datasets"),
-        agents=_names(agents, ";" if ";" in agents else ",", "--agents"),
+        datasets=_names(datasets, "--datasets"),
+        agents=_names(agents, "--agents", ";" if ";" in agents else ","),
         seeds=seeds,
         first_seed=first_seed,
         updates=None if updates is None else check_steps("--updates", updates),
@@ -260,10 +260,10 @@ def evaluate(
     console.print(f"return {outcome.mean:.1f} ± {outcome.std:.1f} over {len(outcome.returns)} episodes{score}")
 
 
-def _names(text: str, sign: str = ",", option: str = "") -> tuple[str, ...]:
+def _names(text: str, option: str, sign: str = ",") -> tuple[str, ...]:
     names = tuple(name.strip() for name in text.split(sign) if name.strip())
-    if text and not names and option:  # not all that there are
-        raise ConfigError(f"{option} {text!r} names none", key=option, hint="Leave it out for all, or name some.")
+    if text and not names:  # not all that there are
+        raise ConfigError(f"{option} {text!r} names none", key=option, hint="Leave it out for the default, or name some.")
     return names
 
 

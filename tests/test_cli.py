@@ -235,6 +235,21 @@ def test_evaluations_with_more_episodes_than_seeds_are_refused(command: tuple[st
     assert outcome.code == 2 and command[-1] in outcome.stderr and "10000" in outcome.stderr
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ("train", TINY, "--updates", "4", "--first-seed", "4294967295", "--seeds", "2"),
+            "2 seeds from 4294967295 on end at 4294967296",
+        ),
+        (("compare", "--dataset", TINY, "--updates", "4", "--algos", " , "), "--algos ' , ' names none"),
+    ],
+)
+def test_seeds_and_agents_that_there_are_none_of_are_refused(words: tuple[str, ...], message: str, tmp_path: Path) -> None:
+    outcome = sb3_dce(*words, "--eval-freq", "4", "--out", str(tmp_path / "out"))
+    assert outcome.code == 2 and message in outcome.stderr and not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("command", [("reproduce", "config-tables"), ("compare", "--dataset", TINY, "--updates", "4")])
 def test_folder_that_is_a_file_is_one_clear_message(command: tuple[str, ...], tmp_path: Path) -> None:
     (tmp_path / "taken").write_text("")

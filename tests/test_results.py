@@ -20,6 +20,7 @@ from sb3_dce.errors import CheckpointError, ConfigError
 from sb3_dce.experiments import results
 from sb3_dce.experiments.grid import PlannedRun, load_experiment
 from sb3_dce.experiments.results import ResultsError
+from sb3_dce.experiments.same_data import DataHashes
 from sb3_dce.run_files import RunSpec, write_divergence
 from sb3_dce.runs import run
 
@@ -88,10 +89,10 @@ def test_rows_count_as_done_on_the_present_file_and_with_enough_episodes(finishe
     rows = results.import_runs(finished.parent.parent, "table1")
     ((dataset, agent, config, n_updates, seed),) = keys_of(rows)
     spec = RunSpec(agent, dataset, seed, n_updates, "folder", 4, 5, QUICK)
-    plan = PlannedRun("table1", "DCE", dataset, spec, config)
-    assert results.done_runs(rows, [plan]) == {plan.key}
-    assert results.done_runs(rows.assign(dataset_sha256="ab" * 32), [plan]) == set(), "the file has changed"
-    assert results.done_runs(rows, [replace(plan, spec=replace(spec, n_eval_episodes=10))]) == set()
+    plan, here = PlannedRun("table1", "DCE", dataset, spec, config), DataHashes(()).here
+    assert results.done_runs(rows, [plan], here) == {plan.key}
+    assert results.done_runs(rows.assign(dataset_sha256="ab" * 32), [plan], here) == set(), "the file has changed"
+    assert results.done_runs(rows, [replace(plan, spec=replace(spec, n_eval_episodes=10))], here) == set()
 
 
 def test_run_that_is_not_complete_has_no_rows(finished: Path, tmp_path: Path) -> None:

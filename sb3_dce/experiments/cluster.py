@@ -179,7 +179,7 @@ def _refuse_other_data(dataset: str, sha256: str) -> None:
             f"another file (sha256 {own[:8]}…) than on the machine that asked ({sha256[:8]}…)",
             where=str(path),
             path=path,
-            hint="Copy that one to the node: what a node generates has other last digits.",
+            hint="Copy that one to the node: one that a node generates is another file.",
         )
 
 

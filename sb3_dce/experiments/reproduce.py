@@ -13,10 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from stable_baselines3.common.utils import get_device
 
-from sb3_dce.checks import LAST_SEED, check_choice, check_ends_with_evaluation, did_you_mean
-from sb3_dce.data.catalog import resolve
-from sb3_dce.data.hashes import sha256_once
-from sb3_dce.data.locate import search
+from sb3_dce.checks import check_choice, check_ends_with_evaluation, check_seeds, did_you_mean
 from sb3_dce.errors import ConfigError
 from sb3_dce.experiments import results
 from sb3_dce.experiments.evidence import Evidence
@@ -37,6 +34,7 @@ from sb3_dce.experiments.readings import runs_in
 from sb3_dce.experiments.reports import Report, count, make_report
 from sb3_dce.experiments.run import execute, is_complete
 from sb3_dce.experiments.run_times import is_hastened
+from sb3_dce.experiments.same_data import DataHashes
 from sb3_dce.experiments.tables import parts_of
 from sb3_dce.hyperparams import full_name
 from sb3_dce.launch import raise_first
@@ -134,27 +132,28 @@ def reproduce(request: Request, console: Console) -> dict[str, Report]:
     _check_request(request)
     experiments = [load_experiment(name) for name in request.ids]
     scales = {e.id: scale_of(e, request) for e in experiments}
-    imported = results.merge(results.import_runs(folder, request.ids[0]) for folder in request.imports)
+    hashes = DataHashes((request.out, *request.reuse))
+    imported = results.merge(hashes.named(results.import_runs(folder, request.ids[0])) for folder in request.imports)
     if not request.report_only:
         request.out.mkdir(parents=True, exist_ok=True)
         # two calls with one folder take turns: they may have runs in common
         with exclusive(request.out / ".lock", limit=WAIT, note=lambda text: console.print(text, markup=False)):
-            rows, errors = _train(request, experiments, scales, imported, console)
+            rows, errors = _train(request, experiments, scales, imported, hashes, console)
     else:
         errors = []
-        rows = results.merge([_known(request), imported])
-        _keep_rows(rows, request)
+        rows = results.merge([_known(request, hashes), imported])
+        _keep_rows(rows, request, hashes)
         # runs of an unfinished call with this folder are shown, and left for it to keep
         here = replace(request, datasets=(PRESENT,))
         planned = [run for e in experiments for run in plan_runs(e, scales[e.id], here)]
-        unfinished = results.import_runs(request.out / "runs", request.ids[0], planned)
+        unfinished = hashes.named(results.import_runs(request.out / "runs", request.ids[0], planned))
         rows = results.merge([rows, results.without(unfinished, rows)])
         if rows.empty:
             console.print(f"no result rows in {request.out}/rows: nothing has been run", markup=False)
     evidences, reports = {}, {}
     for experiment in experiments:
         length = request.updates if request.report_only else scales[experiment.id].updates
-        evidence = Evidence(experiment, rows, scales[experiment.id], length, hash_here)
+        evidence = Evidence(experiment, rows, scales[experiment.id], length, hashes.here)
         evidences[experiment.id], reports[experiment.id] = evidence, _report(evidence, request.out, console)
     if request.imports:
         _say_imported(imported, evidences, console)
@@ -197,37 +196,33 @@ def _check_request(request: Request) -> None:
         check_page(request.page)
 
 
-def hash_here(dataset_id: str) -> str | None:
-    """
-    Which version of a dataset is here: of runs on several versions, a table shows those on this one.
-
-    :param dataset_id: id of the catalogue
-    :return: SHA-256 of its file on this machine, ``None`` if there is none
-    """
-    path = search(resolve(dataset_id))
-    return None if path is None else sha256_once(path)
-
-
-def _known(request: Request) -> pd.DataFrame:
-    return results.merge([results.read_folder(request.out / "rows"), *map(results.read_folder, request.reuse)])
+def _known(request: Request, hashes: DataHashes) -> pd.DataFrame:
+    return results.merge(hashes.named(results.read_folder(folder)) for folder in (request.out / "rows", *request.reuse))
 
 
 def _train(
-    request: Request, experiments: list[Experiment], scales: dict[str, Scale], imported: pd.DataFrame, console: Console
+    request: Request,
+    experiments: list[Experiment],
+    scales: dict[str, Scale],
+    imported: pd.DataFrame,
+    hashes: DataHashes,
+    console: Console,
 ) -> tuple[pd.DataFrame, list[BaseException]]:
     """Run what is missing and keep its rows; all rows there are then, and errors of runs."""
     planned = [run for e in experiments for run in plan_runs(e, scales[e.id], request)]
-    known = results.merge([_known(request), imported])
-    done = results.done_runs(known, planned)
+    known = results.merge([_known(request, hashes), imported])
+    done = results.done_runs(known, planned, hashes.here)
     for run in {run.spec.folder: run for run in planned}.values():
         refuse_other_run(_with_its_precision(run.spec), Path(run.spec.folder))
     _say_plan(planned, done, scales, request.precision, known, console)
     diverged, errors = execute(planned, done, request.workers, request.device, request.ray_address, console)
     for text in diverged:
         console.print(f"diverged: {text}", markup=False)
-    fresh = results.planned_rows(planned)  # first, since a run that is known by fewer episodes has been trained again
+    fresh = hashes.named(
+        results.planned_rows(planned)
+    )  # first, since a run that is known by fewer episodes has been trained again
     rows = results.merge([fresh, known])
-    _keep_rows(rows, request)
+    _keep_rows(rows, request, hashes)
     return rows, errors
 
 
@@ -284,9 +279,7 @@ def scale_of(experiment: Experiment, request: Request) -> Scale:
     if not request.report_only:  # runs that are there say themselves when they were evaluated
         check_ends_with_evaluation(updates, every)
     seeds = request.seeds or scale.seeds
-    if (last := request.first_seed + seeds - 1) > LAST_SEED:
-        hint = f"The last seed there can be is {LAST_SEED}: begin with a smaller one, or take fewer."
-        raise ConfigError(f"{seeds} seeds from {request.first_seed} on end at {last}", key="--first-seed", hint=hint)
+    check_seeds(request.first_seed, seeds)
     return replace(scale, updates=updates, eval_freq=every, seeds=seeds)
 
 
@@ -370,13 +363,13 @@ def _say_plan(
             console.print(f"at this scale {algo} has {settings}", markup=False)
 
 
-def _keep_rows(rows: pd.DataFrame, request: Request) -> None:
+def _keep_rows(rows: pd.DataFrame, request: Request, hashes: DataHashes) -> None:
     """One file per experiment, of runs that are new or have other rows now; what a reused folder holds is not copied."""
     folder = request.out / "rows"
-    new = results.changed(rows, _known(request))
+    new = results.changed(rows, _known(request, hashes))
     for name in new["experiment"].unique():
         path = folder / f"{name}.csv.gz"
-        before = [results.read_rows(path)] if path.is_file() else []
+        before = [hashes.named(results.read_rows(path))] if path.is_file() else []
         results.write_rows(path, results.merge([new[new["experiment"] == name], *before]))
 
 

@@ -12,7 +12,7 @@ import csv
 import json
 import re
 import zlib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,7 @@ import numpy as np
 import pandas as pd
 
 from sb3_dce.configuration import config_hash, differences
-from sb3_dce.data import find_file
 from sb3_dce.data.catalog import resolve
-from sb3_dce.data.hashes import sha256_once
 from sb3_dce.data.locate import catalogue_id, short_name
 from sb3_dce.errors import CheckpointError, ConfigError, SB3DCEError
 from sb3_dce.evaluation import Evaluation, read_evaluations
@@ -195,12 +193,15 @@ def changed(rows: pd.DataFrame, before: pd.DataFrame) -> pd.DataFrame:
     return without(rows, without(rows, rows[other]))
 
 
-def done_runs(rows: pd.DataFrame, planned: Iterable[PlannedRun]) -> set[tuple[Any, ...]]:
+def done_runs(
+    rows: pd.DataFrame, planned: Iterable[PlannedRun], hash_here: Callable[[str], str | None]
+) -> set[tuple[Any, ...]]:
     """
     Which runs need no training; one that diverged, or that could not be evaluated, needs no episodes for that.
 
     :param rows: rows
     :param planned: runs of a grid
+    :param hash_here: gives the SHA-256 by which rows name a dataset's file on this machine
     :return: keys of those that the rows hold, on the file that is here now and evaluated over at least as many episodes
     """
     lost = set(rows[rows["metric"] == "diverged"][RUN_KEY].itertuples(index=False, name=None))
@@ -211,7 +212,7 @@ def done_runs(rows: pd.DataFrame, planned: Iterable[PlannedRun]) -> set[tuple[An
     done = set()
     for run in planned:
         dataset, *others = run.key
-        key = (dataset, sha256_once(find_file(dataset)[0]), *others)
+        key = (dataset, hash_here(dataset), *others)
         # a run without a simulator has no evaluation, and one that diverged perhaps not the last
         if key in known and (key in lost or key not in scored or episodes.get(key, 0) >= run.spec.n_eval_episodes):
             done.add(run.key)
