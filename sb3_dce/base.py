@@ -32,7 +32,7 @@ from sb3_dce.execution import EXECUTIONS, Engine, Update, choose_execution
 from sb3_dce.hyperparams import constructor_parameters
 from sb3_dce.networks import StandardizedExtractor
 from sb3_dce.noise import NoiseSpec
-from sb3_dce.precision import PRECISIONS, matmul_precision
+from sb3_dce.precision import PRECISIONS, denormals_as_zero, matmul_precision
 from sb3_dce.processes import UninterruptedBlock
 from sb3_dce.saving import SavingMixin
 from sb3_dce.sb3_checks import (
@@ -426,7 +426,7 @@ class OfflineAlgorithm(DiagnosticsMixin, SavingMixin):
 
         # statistics of VecNormalize are applied on the processor
         on_device = None if self._vec_normalize_env is not None else generator
-        with matmul_precision(self.precision, self.device):
+        with denormals_as_zero(), matmul_precision(self.precision, self.device):
             for _ in range(gradient_steps):
                 variant = self.update_variant(self._n_updates)
                 # The networks of an update are written one after the other. The first call may compile for a minute.

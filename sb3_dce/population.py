@@ -28,7 +28,7 @@ from sb3_dce.execution import Engine, choose_execution
 from sb3_dce.networks import StandardizedExtractor
 from sb3_dce.noise import NoiseSpec
 from sb3_dce.optimizers import Learner
-from sb3_dce.precision import matmul_precision
+from sb3_dce.precision import denormals_as_zero, matmul_precision
 from sb3_dce.processes import UninterruptedBlock
 from sb3_dce.state import Storage
 
@@ -144,7 +144,7 @@ class Population:
         on_device = None if self.own_randomness else self._generator
         source = (first.batch_size, first.precision, tuple(specs.items()))
         try:
-            with matmul_precision(first.precision, self.device):
+            with denormals_as_zero(), matmul_precision(first.precision, self.device):
                 for _ in range(n_updates):
                     variant = first.update_variant(self._n_updates)
                     with UninterruptedBlock() if engine.has_run(variant) else nullcontext():

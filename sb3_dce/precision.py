@@ -1,5 +1,5 @@
 """
-Cheaper matrix products for the time of training. The switches of PyTorch are process-wide, so they are put back.
+Faster arithmetic for the time of training. The switches of PyTorch hold for a whole process or thread, so they are put back.
 
 ``bf16-matmul`` has two forms. Processors with AMX round the factors themselves (the switch of PyTorch). Those that only have
 AVX-512 bf16 ignore that switch, so the layers are given rounded factors by hand, which doubles the speed of their products.
@@ -74,6 +74,26 @@ def matmul_precision(precision: str, device: th.device) -> Iterator[None]:
         yield
     finally:
         switch.fp32_precision = before
+
+
+@contextlib.contextmanager
+def denormals_as_zero() -> Iterator[None]:
+    """
+    Let this thread compute numbers below 1.2e-38 (float32), which have fewer digits the smaller they are, as zero.
+
+    The moments that Adam keeps of units that no longer learn fade through them, as do the gradients there. They mean nothing,
+    but processors of Intel take a hundred times as long for each: ``benchmarks/denormals.py`` has what this saves.
+    """
+    before = _denormals_are_zero()
+    th.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        th.set_flush_denormal(before)
+
+
+def _denormals_are_zero() -> bool:
+    return float(th.tensor(th.finfo(th.float32).tiny) / 2) == 0.0  # PyTorch does not tell
 
 
 def missing_for(precision: str, device: th.device) -> str | None:

@@ -19,7 +19,7 @@ from sb3_dce.capture import CapturedStep, CaptureError, StaticInputs
 from sb3_dce.errors import ConfigError, SB3DCEWarning
 from sb3_dce.execution import UPDATES_WORTH_A_COMPILED_CALLER, choose_execution
 from sb3_dce.metric_sums import MetricSums
-from sb3_dce.precision import RoundedLinear, _warn_once, matmul_precision, missing_for
+from sb3_dce.precision import RoundedLinear, _warn_once, denormals_as_zero, matmul_precision, missing_for
 
 CPU, CUDA = th.device("cpu"), th.device("cuda")
 
@@ -242,6 +242,26 @@ def test_precision_is_put_back_even_after_an_error(rounds_itself: bool, monkeypa
     with matmul_precision("float32", CPU):
         assert th.backends.mkldnn.matmul.fp32_precision == before
     assert _wide_product_error() < 1e-5
+
+
+def test_training_computes_denormal_numbers_as_zero_and_leaves_the_thread_as_it_was() -> None:
+    half = th.tensor(1e-38) / 2  # denormal itself
+    seen: list[float] = []
+
+    class Probe(OfflineDCE):
+        def read_state(self, state: Any) -> None:
+            seen.append(float(half * 1.5))
+
+        def reads_state_after(self, n_updates: int) -> bool:
+            return True
+
+    model = Probe("MlpPolicy", dataset="halfcheetah-tiny-sb3", seed=0, policy_kwargs={"net_arch": [8]}, batch_size=16)
+    assert float(half * 1.5) > 0
+    model.learn(2)
+    assert seen == [0.0, 0.0] and float(half * 1.5) > 0
+    with pytest.raises(RuntimeError, match="stop"), denormals_as_zero(), denormals_as_zero():
+        raise RuntimeError("stop")
+    assert float(half * 1.5) > 0
 
 
 def test_tf32_is_left_out_by_a_pytorch_without_its_switch(monkeypatch: pytest.MonkeyPatch) -> None:
