@@ -81,8 +81,8 @@ def denormals_as_zero() -> Iterator[None]:
     """
     Let this thread compute numbers below 1.2e-38 (float32), which have fewer digits the smaller they are, as zero.
 
-    The moments that Adam keeps of units that no longer learn fade through them, as do the gradients there. They mean nothing,
-    but processors of Intel take a hundred times as long for each: ``benchmarks/denormals.py`` has what this saves.
+    They mean nothing, but matrix products of them take processors of Intel many times as long. CQL's gradients are full of
+    them where its softmax all but ignores an action: ``benchmarks/results/denormals.md``.
     """
     before = _denormals_are_zero()
     th.set_flush_denormal(True)

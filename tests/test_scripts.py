@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 import runpy
 import sys
 from pathlib import Path
@@ -69,3 +71,16 @@ def test_speed_refuses_unknown_agents_and_has_no_column_without_its_reference(
     assert "| offline_iql, eager | 0.50 | 0.50 - 0.50 | 2.00 | 1.00 | 0.0 |" in page and "SB3-manner" not in page
     times[names["MANNER_NAME"]] = [(1.5, 1.5)]
     assert "| 2.00 | 3.00 | 1.00 | 0.0 |" in names["report"](times, dict.fromkeys(times, 0.0), facts)
+
+
+def test_time_that_denormal_numbers_take_is_measured_by_turns(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = ("--only", "dce", "--dataset", "halfcheetah-tiny-sb3", "--execution", "eager", "--before", "2", "--turn", "2")
+    cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
+    try:
+        script("benchmarks/denormals.py", monkeypatch, *arguments, "--repeats", "3", "--out", str(tmp_path / "page"))["main"]()
+    finally:
+        if cores is not None:
+            os.sched_setaffinity(0, cores)
+    found = json.loads((tmp_path / "page.json").read_text())["dce"]
+    assert {way: len(turns) for way, turns in found["cpu_wall_s_per_1000"].items()} == {"without": 3, "as zero": 3}
+    assert "| dce |" in (tmp_path / "page.md").read_text()
