@@ -74,6 +74,10 @@ def test_only_rows_of_the_file_that_is_here_change_their_hash(data: Path, tmp_pa
     named = DataHashes((tmp_path / "out",)).named(results.merge(rows))
     assert named.groupby("seed")["dataset_sha256"].unique().map(list).tolist() == [[theirs], [theirs], [third]]
     assert len(named) == 3 * len(made)
+    twice = results.merge([made.assign(dataset_sha256=sha) for sha in (theirs, ours)])
+    named = DataHashes((tmp_path / "out",)).named(twice)
+    assert len(twice) == 2 * len(made) and len(named) == len(made), "one run"
+    results.check_rows(named, "test")
 
 
 def test_runs_on_data_made_again_join_the_known_ones(data: Path, tmp_path: Path) -> None:

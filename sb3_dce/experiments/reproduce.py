@@ -218,10 +218,8 @@ def _train(
     diverged, errors = execute(planned, done, request.workers, request.device, request.ray_address, console)
     for text in diverged:
         console.print(f"diverged: {text}", markup=False)
-    fresh = hashes.named(
-        results.planned_rows(planned)
-    )  # first, since a run that is known by fewer episodes has been trained again
-    rows = results.merge([fresh, known])
+    # first, since a run that is known by fewer episodes has been trained again
+    rows = results.merge([hashes.named(results.planned_rows(planned)), known])
     _keep_rows(rows, request, hashes)
     return rows, errors
 

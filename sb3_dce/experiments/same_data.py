@@ -18,6 +18,7 @@ from sb3_dce.data.comparison import DatasetCard
 from sb3_dce.data.hashes import sha256_once
 from sb3_dce.data.loading import load_transitions
 from sb3_dce.data.locate import catalogue_id, search
+from sb3_dce.experiments.results import merge
 
 
 class DataHashes:
@@ -35,7 +36,7 @@ class DataHashes:
         places = dict.fromkeys((folder.parent if folder.name == "rows" else folder) / "cards" for folder in folders)
         cards = [DatasetCard.read(path) for place in places for path in sorted(place.glob("*.json"))]
         self._cards = [card for card in cards if catalogue_id(card.id) == card.id]
-        self._known_as: dict[str, str] = {}
+        self._known_as: dict[tuple[str, str], str] = {}
 
     def here(self, dataset_id: str) -> str | None:
         """
@@ -48,20 +49,20 @@ class DataHashes:
         if path is None:
             return None
         own = sha256_once(path)
-        if own not in self._known_as:
+        if (dataset_id, own) not in self._known_as:
             cards = [card for card in self._cards if card.id == dataset_id]
             is_new = bool(cards) and all(card.sha256 != own for card in cards)
             content = _content_hash(path) if is_new else None
             same = (card.sha256 for card in cards if card.content_hash == content and card.sha256 is not None)
-            self._known_as[own] = next(same, own)
-        return self._known_as[own]
+            self._known_as[dataset_id, own] = next(same, own)
+        return self._known_as[dataset_id, own]
 
     def named(self, rows: pd.DataFrame) -> pd.DataFrame:
         """
         Rows of runs on a file that is here, under the hash that counts; others stay as they are.
 
         :param rows: rows
-        :return: rows
+        :return: rows, each run once
         """
         known = {(card.id, card.sha256) for card in self._cards}
         with_card = {card.id for card in self._cards}
@@ -70,7 +71,8 @@ class DataHashes:
             path = search(resolve(name))
             if path is not None and sha256_once(path) == sha256:
                 is_own = (rows["dataset"] == name) & (rows["dataset_sha256"] == sha256)
-                rows = rows.assign(dataset_sha256=rows["dataset_sha256"].mask(is_own, self.here(name)))
+                own = rows[is_own].assign(dataset_sha256=self.here(name))
+                rows = merge([rows[~is_own], own])  # the same run may be there under both
         return rows
 
 
