@@ -82,8 +82,8 @@ def denormals_as_zero() -> Iterator[None]:
     """
     Let this thread compute numbers below 1.2e-38 (float32), which have fewer digits the smaller they are, as zero.
 
-    They mean nothing, but matrix products of them take processors of Intel many times as long. CQL's gradients are full of
-    them where its softmax all but ignores an action: ``benchmarks/results/denormals.md``.
+    They mean nothing, but take processors of Intel many times as long. CQL's gradients are full of them where its softmax all
+    but ignores an action, and Adam's moments of units that no longer learn: ``benchmarks/results/denormals.md``.
     """
     before = _denormals_are_zero()
     th.set_flush_denormal(True)
