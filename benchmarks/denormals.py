@@ -1,7 +1,7 @@
 """
 What computing denormal numbers as zero saves: seconds per 1000 updates with it, as training has it, and without.
 
-    python benchmarks/denormals.py                                        # CQL and DCE on the embedded data; ten minutes
+    python benchmarks/denormals.py                 # CQL and DCE on the embedded data; up to half an hour
     python benchmarks/denormals.py --only offline_cql --dataset pen-expert-sb3
 
 Such numbers come with training, so of each agent there are two models with one seed, trained to the same length; then these
@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import os
 import shlex
 import statistics
 import sys
@@ -25,6 +24,7 @@ from unittest import mock
 
 import torch as th
 from loading import RESULTS, machine
+from speed import keep_to_one_core, known_agents
 from stable_baselines3.common.logger import Logger
 
 from sb3_dce.agents import AGENTS
@@ -129,13 +129,8 @@ def main() -> None:
     parser.add_argument("--core", type=int, default=None, help="core to run on; default: the last one")
     parser.add_argument("--out", type=Path, default=RESULTS / "denormals")
     options = parser.parse_args()
-    algos = [name for name in options.only.split(",") if name]
-    if unknown := set(algos) - set(AGENTS):
-        parser.error(f"--only: no agent is called {', '.join(sorted(unknown))}; there are {', '.join(AGENTS)}")
-    if hasattr(os, "sched_setaffinity"):
-        cores = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, {cores[-1] if options.core is None else options.core})
-    th.set_num_threads(1)
+    algos = known_agents(parser, options.only)
+    keep_to_one_core(options.core)
     numbers = (options.before, options.turn, options.repeats)
     found = {algo: measure(algo, options.dataset, options.execution, *numbers) for algo in algos}
     facts = {

@@ -14,15 +14,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import time
 import warnings
 from pathlib import Path
 from typing import Any
 
-import torch as th
 from loading import RESULTS, machine, make_arrays
-from speed import BATCH, make_agent
+from speed import BATCH, keep_to_one_core, make_agent
 from torch.profiler import ProfilerActivity, profile
 
 from sb3_dce import Transitions
@@ -112,10 +110,7 @@ def main() -> None:
     import torch._inductor.config as inductor
 
     inductor.cpp.enable_kernel_profile = True  # gives the fused kernels names in the profile
-    if hasattr(os, "sched_setaffinity"):
-        cores = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, {cores[-1] if options.core is None else options.core})
-    th.set_num_threads(1)
+    keep_to_one_core(options.core)
     warnings.filterwarnings("ignore", category=DeprecationWarning)
     transitions = Transitions.from_arrays(**make_arrays(200_000))
     model = make_agent(agent_class(options.algo), transitions, "compile", options.precision)

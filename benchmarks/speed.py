@@ -209,6 +209,29 @@ def report(times: dict[str, list[tuple[float, float]]], first: dict[str, float],
     return "\n".join(lines) + "\n"
 
 
+def keep_to_one_core(core: int | None) -> None:
+    """
+    Run this process, with one thread, on one core from now on.
+
+    :param core: its number; ``None`` for the last one
+    """
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0)) if core is None else core})
+    th.set_num_threads(1)
+
+
+def known_agents(parser: argparse.ArgumentParser, text: str) -> list[str]:
+    """
+    :param parser: ends the program if there is no such agent
+    :param text: of ``--only``, names of agents separated by commas
+    :return: names
+    """
+    names = [name for name in text.split(",") if name]
+    if unknown := set(names) - set(AGENTS):
+        parser.error(f"--only: no agent is called {', '.join(sorted(unknown))}; there are {', '.join(AGENTS)}")
+    return names
+
+
 def main() -> None:
     """Measure, write, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -220,14 +243,9 @@ def main() -> None:
     parser.add_argument("--core", type=int, default=None, help="core to run on; default: the last one")
     parser.add_argument("--out", type=Path, default=RESULTS / "speed")
     options = parser.parse_args()
-    only = [name for name in options.only.split(",") if name]
-    if unknown := set(only) - set(AGENTS):
-        parser.error(f"--only: no agent is called {', '.join(sorted(unknown))}; there are {', '.join(AGENTS)}")
+    only = known_agents(parser, options.only)
 
-    if hasattr(os, "sched_setaffinity"):
-        cores = sorted(os.sched_getaffinity(0))
-        os.sched_setaffinity(0, {cores[-1] if options.core is None else options.core})
-    th.set_num_threads(1)
+    keep_to_one_core(options.core)
     warnings.filterwarnings("ignore", category=DeprecationWarning)
     arrays = make_arrays(options.rows)
     transitions = Transitions.from_arrays(**arrays)
